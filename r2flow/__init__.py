@@ -10,7 +10,7 @@ Notation everywhere: `t = 0` is noise and `t = 1` is data; `x_0 ~ N(0, I)`, `x_1
 
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -81,17 +81,39 @@ def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoin
     return load_checkpoint(name, choose_device(str(device), "device"))
 
 
+@overload
 def read(
     path: "str | Path",
     sensor: "Sensor | str | None" = None,
     reflectance_scale: float | None = None,
     columns: "Sequence[str] | None" = None,
-) -> "torch.Tensor":
+    return_sensor: Literal[False] = False,
+) -> "torch.Tensor": ...
+
+
+@overload
+def read(
+    path: "str | Path",
+    sensor: "Sensor | str | None" = None,
+    reflectance_scale: float | None = None,
+    columns: "Sequence[str] | None" = None,
+    *,
+    return_sensor: Literal[True],
+) -> "tuple[torch.Tensor, Sensor]": ...
+
+
+def read(
+    path: "str | Path",
+    sensor: "Sensor | str | None" = None,
+    reflectance_scale: float | None = None,
+    columns: "Sequence[str] | None" = None,
+    return_sensor: bool = False,
+) -> "torch.Tensor | tuple[torch.Tensor, Sensor]":
     """Read a scan from a file: range in metres and reflectance, (2, H, W) float32, 0 for rays
     without a return.
 
     Args:
-        path: A scan file, a range image (.npy) or a sample of the published R2Flow code (.pth).
+        path: A scan file, a range image (.npy) or a sample of the published code (.pth).
         sensor: Sensor of the image, or its name or YAML file. Default: the sensor in the manifest
             of a folder that r2flow wrote, else the built-in sensor with the file's beams, else
             hdl64e; a range image keeps its size.
@@ -101,10 +123,12 @@ def read(
             divided by 100, 255, 256 or 65535.
         columns: Names of the columns of a file without names, as ("x", "y", "z", "intensity", "_");
             fields to rename in a file with names, as ("intensities=reflectance",).
+        return_sensor: Return the sensor of the image, too.
 
     Raises:
         InputError: the file cannot be read, or no point is in the sensor's field of view.
     """
     from r2flow.data.opening import read
 
-    return read(path, sensor, reflectance_scale, columns)
+    image, found = read(path, sensor, reflectance_scale, columns)
+    return (image, found) if return_sensor else image

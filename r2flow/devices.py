@@ -1,5 +1,7 @@
 """Choice of the device."""
 
+from typing import Any
+
 from r2flow.errors import InputError
 
 
@@ -20,3 +22,11 @@ def choose_device(name: str, option: str = "--device") -> str:
         seen = f"{count} of them" if count else "no GPU"
         raise InputError(f"{option} {name}, but torch sees {seen} here; use {option} cpu.")
     return name
+
+
+def multiplies_bfloat16() -> bool:
+    """Whether the CPU has instructions for products of bfloat16; False on torch below 2.10."""
+    import torch
+
+    capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
+    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))

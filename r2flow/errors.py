@@ -94,13 +94,11 @@ def warn_odd(path: Path, kind: str, points: int = 0) -> None:
     """Warn about odd values of a file, once per folder and kind in a process; points in memory
     count as a folder.
     """
-    folder, name = path.parent, path
-    if folder.name.startswith(IN_MEMORY):  # each scan has a new folder
-        folder = name = Path(IN_MEMORY)
+    folder = path if path.name == IN_MEMORY else path.parent
     if (folder, kind) not in _warned:
         _warned.add((folder, kind))
         number = f" ({points:,} points; reported once per folder)" if points else ""
-        log.warning("%s: %s%s", name, kind, number)
+        log.warning("%s: %s%s", path, kind, number)
 
 
 def explain_mistake(error: InputError | OSError) -> str:

@@ -20,6 +20,9 @@ from r2flow.errors import InputError
 
 T = TypeVar("T")
 
+Options = Mapping[str, Any]  # of a config, by key
+Config = dict[str, Any]  # a config, or a part of one
+
 MISSING = "???"  # OmegaConf's mandatory value
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
 
@@ -204,9 +207,7 @@ def check_options(
         return _schema(constructor, given).validate_python(dict(options))
 
 
-def construct(
-    what: str, constructor: Callable[..., T], options: Mapping[str, Any] | None, *args: Any
-) -> T:
+def construct(what: str, constructor: Callable[..., T], options: Options | None, *args: Any) -> T:
     """Call a constructor with `args` and checked options of a config; None: its defaults."""
     checked = check_options(what, constructor, options or {}, given=len(args))
     with _in_one_line(

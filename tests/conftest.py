@@ -67,6 +67,7 @@ TINY: dict[str, dict[str, Any]] = {
         "num_residual_blocks": 1,
         "num_heads": 2,
     },
+    "vit": {"channels": 16, "depth": 2, "heads": 2, "time_channels": 16, "patch": [4, 4]},
     "local": {"channels": 8, "dilations": [1, 2]},
 }
 TINY["efficient_unet"] = TINY["adm_unet"]

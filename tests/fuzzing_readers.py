@@ -13,10 +13,12 @@ from r2flow.data.pairs import PairStore
 from r2flow.data.prepared import PreparedScans
 from r2flow.data.reading import Reading, read_image
 from r2flow.errors import InputError
+from r2flow.files import reading
 from r2flow.lidar.labels import read_labels
-from r2flow.lidar.scan_files import read_points
+from r2flow.lidar.scan_files import LARGEST_FILE, read_points
+from r2flow.lidar.scan_files.pickled import read_table
 from r2flow.lidar.sensors import SENSORS, read_sensor
-from r2flow.metrics.extractors.base import read_published
+from r2flow.metrics.extractors.base import _read_published
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.runs.folder import read_config
 from r2flow.store import Damaged
@@ -93,11 +95,16 @@ def config(path: Path) -> None:
 
 
 def weights(path: Path) -> None:
-    read_published(path)
+    _read_published(path)
+
+
+def table(path: Path) -> None:
+    with reading(path, LARGEST_FILE):
+        read_table(path)
 
 
 READERS: dict[str, Callable[[Path], object]] = {
     "points": points, "image": image, "labels": labels, "prepared": prepared, "pairs": pairs, "checkpoint": checkpoint,
     "samples": samples, "config": config, "weights": weights,
-    "sensor": read_sensor,
+    "sensor": read_sensor, "table": table,
 }  # fmt: skip

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -362,7 +363,10 @@ def test_a_judged_set_may_have_the_name_of_a_baseline(r2flow, real, generated, t
     of = {
         (row["kind"], row["comparison"]): row["printed"] for row in rows if row["metric"] == "jsd"
     }
-    lines = {line.split("  ")[0]: line for line in said.splitlines()}
-    assert f"{of['judged', 'noise']:#.4g}" in lines["noise"]
-    assert f"{of['baseline', 'noise']:#.4g}" in lines["baseline: noise"]
+    lines = said.splitlines()
+    columns = [line.split()[1:] for line in lines if re.match(r"\d+  ", line)]
+    values = next(line.split()[3:] for line in lines if line.startswith("JSD"))  # x 10^2
+    printed = {" ".join(words[:-3]): value for words, value in zip(columns, values, strict=True)}
+    assert printed["noise"] == f"{of['judged', 'noise']:#.4g}"
+    assert printed["baseline: noise"] == f"{of['baseline', 'noise']:#.4g}"
     assert of["judged", "noise"] != of["baseline", "noise"]

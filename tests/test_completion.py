@@ -8,6 +8,7 @@ import torch
 from r2flow.errors import InputError
 from r2flow.generators import Generator
 from r2flow.lidar.known import Ray, ray_states
+from r2flow.model import completion
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.model.completion import Completed, complete, completing
 from r2flow.samplers import build_sampler
@@ -139,6 +140,14 @@ def test_coarser_images_of_the_own_sensor_are_not_of_another(r2flow, tmp_path, s
 def test_a_model_of_another_sensor_is_not_saved_as_that_of_training(tmp_path):
     with pytest.raises(InputError, match="save the model before `through`"):
         network().through("vlp16").save(tmp_path / "moved.safetensors")
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_a_transfer_flow_computes_in_bfloat16_on_processors_that_have_it(fast, monkeypatch):
+    monkeypatch.setattr(completion, "multiplies_bfloat16", lambda: fast)
+    expected = "bf16-mixed" if fast else "32-true"
+    assert completion.usual_precision(network().generator) == expected
+    assert completion.usual_precision(network("rectified_flow").generator) == "32-true"
 
 
 def test_a_generator_that_cannot_complete_is_refused():

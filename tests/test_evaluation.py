@@ -21,10 +21,10 @@ from r2flow.evaluation.measuring import (
     MetricResult,
     Statistics,
     Work,
+    _real_rule,
     gather_real,
     key_of,
     measure,
-    real_rule,
 )
 from r2flow.evaluation.sets import reference_sets, sampled_set
 from r2flow.lidar.projection import image_to_points
@@ -184,7 +184,7 @@ def test_the_fixed_shuffle_is_stated_and_does_not_change():
         81106
     )
     assert fixed_choice(81106, 10000)[:3] == sorted(shuffled[:10000])[:3]
-    assert real_rule(JSD(), open_scans("simulated:0", READING, num=10_000)) == (
+    assert _real_rule(JSD(), open_scans("simulated:0", READING, num=10_000)) == (
         range(10_000),
         "all 10000",
     )

@@ -26,6 +26,7 @@ from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.saving import save_checkpoint
 from r2flow.store import Store
 from tests.conftest import CONFIG, ROOT, SENSOR, prepare_folder
+from tests.data.test_pandaset import table
 from tests.fuzzing_readers import READERS
 from tests.lidar.test_scan_files_damage import (
     FORMATS,
@@ -101,6 +102,10 @@ def write_stores(folder: Path, beside: Path) -> None:
     keep(folder, "config", beside / "run" / "config.yaml")
     write_sensor(replace(SENSORS["vlp16"], name="mine"), beside / "mine.yaml", "of a test")
     keep(folder, "sensor", beside / "mine.yaml")
+    columns = {"x": np.arange(4.0), "d": np.arange(4)}
+    for protocol in (3, 5):
+        (beside / f"{protocol}.pkl").write_bytes(table(columns, protocol))
+        keep(folder, "table", beside / f"{protocol}.pkl")
 
 
 def write_weights(folder: Path, beside: Path, run: Path) -> None:

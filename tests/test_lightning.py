@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader
 
 import r2flow
 from r2flow import Distill, Rectify, Reflow, ScanDataModule
+from r2flow.errors import InputError
 from tests.conftest import ROOT, quiet_trainer
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*")
@@ -210,6 +211,71 @@ def test_scans_of_any_loader(tmp_path: Path):
 
 def test_other_scans_than_the_module_s_are_refused(tmp_path: Path):
     with pytest.raises(
-        r2flow.errors.InputError, match="the module's images are 64x1024 of hdl64e, the data's 8x64"
+        InputError, match="the module's images are 64x1024 of hdl64e, the data's 8x64"
     ):
         quiet_trainer(tmp_path, max_steps=1).fit(Rectify("hdit_tiny"), scans())
+
+
+def test_a_loader_by_itself_draws_new_noise_in_every_epoch(tmp_path: Path):
+    seen: list[int] = []
+
+    class Note(L.Callback):
+        def on_train_batch_start(self, trainer, module, batch, batch_idx):
+            seen.extend(batch["k"].tolist())
+
+    data = scans()
+    loader = data.train_dataloader()
+    quiet_trainer(tmp_path, max_epochs=2, callbacks=[Note()], limit_val_batches=0).fit(
+        flow(), loader
+    )
+    assert seen == list(range(2 * len(loader.sampler)))
+
+
+def test_a_loader_by_itself_is_shared_by_processes(monkeypatch):
+    sampler = scans().train_dataloader().sampler
+    seen = []
+    for rank in range(2):
+        monkeypatch.setattr("r2flow.data.loader.rank_and_world_size", lambda rank=rank: (rank, 2))
+        seen.append([k for k, _ in sampler])
+        assert len(sampler) == len(seen[-1])
+    assert sorted(seen[0] + seen[1]) == list(range(8))
+
+
+def test_weights_that_do_not_fit_are_loaded_where_asked(tmp_path: Path):
+    trainer = quiet_trainer(tmp_path, max_steps=1, limit_val_batches=0)
+    trainer.fit(flow(), scans())
+    trainer.save_checkpoint(tmp_path / "a.ckpt")
+
+    class Other(Rectify):
+        def __init__(self, *model, **options):
+            super().__init__(*model, **options)
+            self.head = torch.nn.Linear(2, 2)
+
+    with pytest.raises(InputError, match=r"2 names missing \['head.bias', 'head.weight'\]"):
+        Other.load_from_checkpoint(tmp_path / "a.ckpt")
+    loaded = Other.load_from_checkpoint(tmp_path / "a.ckpt", strict=False)
+    expected = trainer.lightning_module.state_dict()
+    assert all(torch.equal(loaded.state_dict()[name], expected[name]) for name in expected)
+
+
+@pytest.mark.parametrize("shape", [(4, 1, 8, 64), (4, 2, 1, 64), (4, 2, 16, 64)])
+def test_scans_of_another_shape_are_refused(tmp_path: Path, shape: tuple[int, ...]):
+    with pytest.raises(InputError, match="x_1 must be scans"):
+        flow().whole_batch({"x_1": torch.rand(shape)})
+    with pytest.raises(InputError, match=r"up to 80: encode metres"):
+        flow().whole_batch({"x_1": torch.full((1, 2, 8, 64), 80.0)})
+
+
+def test_loaders_of_any_kind(tmp_path: Path):
+    x_1 = list(torch.rand(8, 2, 8, 64))
+    batches = torch.utils.data.BatchSampler(range(8), 2, drop_last=True)
+    loaders = (
+        DataLoader(x_1, batch_sampler=batches),
+        DataLoader(x_1, None, collate_fn=lambda x: x[None]),
+    )
+    for loader in loaders:
+        trainer = quiet_trainer(tmp_path, max_steps=1, val_check_interval=1)
+        trainer.fit(flow(), loader, [DataLoader(x_1, 2), DataLoader(x_1, 4)])
+        assert {"val/loss/dataloader_idx_0", "val/loss/dataloader_idx_1"} <= set(
+            trainer.callback_metrics
+        )

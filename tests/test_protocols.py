@@ -13,8 +13,8 @@ import torch
 from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading
 from r2flow.errors import InputError
-from r2flow.evaluation.measuring import Work, gather_real, measure, real_rule
-from r2flow.evaluation.protocols import PAPER, R2FLOW, published_choice
+from r2flow.evaluation.measuring import Work, _real_rule, gather_real, measure
+from r2flow.evaluation.protocols import PAPER, R2FLOW, _published_choice
 from r2flow.lidar.scan_files import write_points
 from r2flow.metrics import METRICS
 from tests.conftest import SENSOR, folder, images
@@ -113,13 +113,13 @@ def test_the_paper_s_subset_is_its_own_draw_of_all_scans_with_test_drives_last(
     random.Random(0).shuffle(place)
     theirs = [*range(6, 15), *range(6)]  # drives 3, 4, 10, then 0, 2
     expected = sorted(theirs[p] for p in place[:5])
-    assert published_choice(scans, 5) == expected
-    assert real_rule(METRICS["jsd"](), scans, PAPER) == (
+    assert _published_choice(scans, 5) == expected
+    assert _real_rule(METRICS["jsd"](), scans, PAPER) == (
         expected,
         "5 of 15, Python's shuffle, seed 0",
     )
-    assert real_rule(METRICS["jsd"](), scans)[0] != expected
-    assert published_choice(open_scans("simulated:0", READING, num=15), 5) == sorted(place[:5])
+    assert _real_rule(METRICS["jsd"](), scans)[0] != expected
+    assert _published_choice(open_scans("simulated:0", READING, num=15), 5) == sorted(place[:5])
 
 
 def test_scans_without_measured_points_are_refused(generated):

@@ -10,6 +10,7 @@ from r2flow.backbones.base import Backbone
 from r2flow.backbones.efficient_unet import EfficientUNet
 from r2flow.backbones.hdit import HDiT
 from r2flow.backbones.local import Local
+from r2flow.backbones.vit import ViT
 from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS
 from r2flow.registry import Registry, presets
@@ -38,7 +39,7 @@ class _Backbones(Registry[type[Backbone]]):
 
 
 BACKBONES = _Backbones(
-    "backbone", hdit=HDiT, adm_unet=ADMUNet, efficient_unet=EfficientUNet, local=Local
+    "backbone", hdit=HDiT, adm_unet=ADMUNet, efficient_unet=EfficientUNet, vit=ViT, local=Local
 )
 
 

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +10,8 @@ from torch import Tensor, nn
 from r2flow.backbones.layers import ExactBuffers, at_least_float32
 from r2flow.errors import InputError
 from r2flow.registry import Positive
+
+Prediction = Literal["velocity", "data", "noise"]
 
 
 class Backbone(ExactBuffers):
@@ -41,7 +43,9 @@ class Backbone(ExactBuffers):
         in_channels: Channels C of the image plus those of the condition concatenated to it.
         out_channels: Channels C' of the output; None: C.
         second_time: Whether the network takes s.
-        data_std: Standard deviation of the data, for `precondition`; None: the network is v itself.
+        prediction: What the network predicts: `velocity`, or `data` or `noise`, from which the
+            velocity is computed by `reparametrise`.
+        data_std: Standard deviation of the data, for `precondition`; None: no preconditioning.
     """
 
     takes_second_time = False
@@ -59,15 +63,21 @@ class Backbone(ExactBuffers):
         in_channels: int = 2,
         out_channels: int | None = None,
         second_time: bool = False,
+        prediction: Prediction = "velocity",
         data_std: Positive | None = None,
     ) -> None:
         super().__init__()
         self.unit = unit
         self.second_time = second_time
+        self.prediction = prediction
         self.data_std = data_std
         self.in_channels = in_channels
         self.out_channels = out_channels or in_channels
         name = type(self).__name__
+        if data_std is not None and prediction != "velocity":
+            raise InputError(
+                "backbone.data_std has its own prediction: leave it or backbone.prediction out."
+            )
         if second_time and not self.takes_second_time:
             raise InputError(
                 f"{name} takes no second time: choose a backbone that does, such as hdit, or "
@@ -91,11 +101,15 @@ class Backbone(ExactBuffers):
         """
         t = _times(t, x)
         s = t if s is None else _times(s, x)
-        if self.data_std is None:
+        if self.data_std is None and self.prediction == "velocity":
             return self._velocity(t, x, s).to(x.dtype)
         image = at_least_float32(x[:, : self.out_channels])
-        into, skip, out = precondition(t, self.data_std)
-        inner = torch.cat([into * image, x[:, self.out_channels :]], dim=1)
+        if self.data_std is None:
+            skip, out = reparametrise(t, self.prediction)
+            inner = x
+        else:
+            into, skip, out = precondition(t, self.data_std)
+            inner = torch.cat([into * image, x[:, self.out_channels :]], dim=1)
         return (skip * image + out * self._velocity(t, inner, s)).to(x.dtype)
 
     def _velocity(self, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
@@ -108,6 +122,20 @@ class Backbone(ExactBuffers):
                 f"a {type(self).__name__} must give images of {expected}, found {tuple(v.shape)}."
             )
         return v
+
+    @property
+    def parametrised(self) -> str:
+        """How the velocity is computed from what the network predicts, in words."""
+        scaled = "" if self.data_std is None else f", data_std={self.data_std}"
+        return f"prediction={self.prediction}{scaled}"
+
+    def refuse_parametrised(self, what: str) -> None:
+        """Refuse options that make a velocity of the output, for a model that learns another."""
+        if self.parametrised != "prediction=velocity":
+            raise InputError(
+                f"a {what} predicts no velocity: leave backbone.prediction and data_std out, found "
+                f"{self.parametrised}."
+            )
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         """The field for t of shape (B,), or (1,) for the whole batch, in float32 or better.
@@ -169,6 +197,24 @@ def precondition(t: Tensor, data_std: float) -> tuple[Tensor, Tensor, Tensor]:
     variance = (t * data_std).square() + (1 - t).square()
     into = variance.rsqrt()
     return into, (t * data_std**2 - (1 - t)) / variance, data_std * into
+
+
+def reparametrise(t: Tensor, prediction: Prediction) -> tuple[Tensor, Tensor]:
+    """Factors of a network F that predicts x_1 (`data`) or x_0 (`noise`), (B or 1, 1, 1, 1) each:
+
+        v(t, x) = skip(t) x + out(t) F(t, x)
+        data:  v = (F - x) / max(1 - t, 0.05)
+        noise: v = (x - F) / max(t, 0.05)
+
+    The loss stays that of the velocity (Li and He 2025, "Back to basics: let denoising generative
+    models denoise"). t is (B,) or (1,).
+    """
+    t = t[:, None, None, None]
+    if prediction == "noise":
+        factor = 1 / t.clamp(min=0.05)
+        return factor, -factor
+    factor = 1 / (1 - t).clamp(min=0.05)
+    return -factor, factor
 
 
 def _follow_loaded_rays(backbone: Backbone, _keys: Any) -> None:

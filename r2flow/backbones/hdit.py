@@ -90,7 +90,7 @@ class HDiT(Backbone):
             options = BlockOptions(width, heads[level], time_channels, highest, near, dropout)
             return nn.ModuleList(Block(options) for _ in range(depths[level]))
 
-        self.timestep_pe = _time_embedding(time_channels, dropout)
+        self.timestep_pe = time_embedding(time_channels, dropout)
         self.tokenizer = nn.Sequential(
             nn.Conv2d(self.in_channels, base_channels, self.patch, self.patch, bias=False)
         )
@@ -112,7 +112,7 @@ class HDiT(Backbone):
             self.detail = Detail(count, wide, ends, base_channels, self.patch, time_channels, ring)
         if self.second_time:
             last = zero_initialised(ExactLinear(time_channels, time_channels, bias=False))
-            self.interval_embedding = _time_embedding(time_channels, dropout).append(last)
+            self.interval_embedding = time_embedding(time_channels, dropout).append(last)
         self.follow_rays()
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
@@ -178,7 +178,7 @@ def _neighbourhood(window: Sequence[int], ring: bool, attention: str) -> Neighbo
     return Neighbourhood((rows, columns), ring, attention)
 
 
-def _time_embedding(channels: int, dropout: float) -> nn.Sequential:
+def time_embedding(channels: int, dropout: float) -> nn.Sequential:
     """t (B,) to (B, channels): random Fourier features and a mapping network."""
     features = RandomFourierFeatures(channels)
     return nn.Sequential(features, mapping_network(channels, ExactLinear, dropout))
@@ -193,7 +193,7 @@ def _position(
     if name == "learnable":
         return _LearnablePosition(tokens, channels)
     return nn.Sequential(
-        _RayFeatures(ENCODINGS[name](tokens), channels),
+        RayFeatures(ENCODINGS[name](tokens), channels),
         mapping_network(channels, nn.Linear, dropout),
     )
 
@@ -210,7 +210,7 @@ class _LearnablePosition(nn.Module):
         return self.embedding
 
 
-class _RayFeatures(nn.Module):
+class RayFeatures(nn.Module):
     """W f for fixed features f of rays, by `embedding`."""
 
     def __init__(self, embedding: RayEncoding, channels: int) -> None:

@@ -119,7 +119,9 @@ def prepare(
     rich_help_panel="Data", epilog="Example: r2flow sensor my/scans --out conf/sensor/mine.yaml"
 )
 def sensor(
-    scans: Annotated[list[Path], Argument(help="Scan files or folders, all of one sensor.")],
+    scans: Annotated[
+        list[Path], Argument(help="Scan files, folders or NAME:FOLDER, all of one sensor.")
+    ],
     out: Annotated[
         Path | None, Option("--out", "-o", help="YAML file to write. Default: print only.")
     ] = None,

@@ -1,9 +1,9 @@
 """`r2flow sample`, `complete` and `interpolate`."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from typer import Argument, Option
 
@@ -264,7 +264,13 @@ def complete(
             "without rays or a --sampler for flows from noise.",
         ),
     ] = None,
-    precision: PrecisionOption = "32-true",
+    precision: Annotated[
+        Literal["32-true", "bf16-mixed"] | None,
+        Option(
+            help="Precision of the network. Default: bf16-mixed for densify on a CPU with "
+            "bfloat16, else 32-true."
+        ),
+    ] = None,
     num: Annotated[int, Option(min=1, help="Completions per scan.")] = 1,
     seed: SeedOption = 0,
     batch_size: BatchOption = 1,
@@ -279,13 +285,13 @@ def complete(
     interrupted run.
     """
     from r2flow.lidar.known import mask_identity, parse_mask
-    from r2flow.model.completion import completing
+    from r2flow.model.completion import completing, usual_precision
     from r2flow.models import DEFAULT, DENSIFY
     from r2flow.reports.completed import Job, lack_sectors, write_completed
 
     check_folder(out)
     mask = parse_mask(given.mask) if given.mask else None
-    job = Job(num, seed, mask, given.fill_gaps, batch_size, pictures, precision)
+    job = Job(num, seed, mask, given.fill_gaps, batch_size, pictures)
     jumps = how.given.get("name", "jump") in ("jump", "transport")
     name = checkpoint or (DENSIFY if jumps else DEFAULT)
     loaded, scans, remarks = given.open(name, device, what)
@@ -295,6 +301,7 @@ def complete(
             name = DEFAULT
             loaded, scans, remarks = given.open(name, device, what)
         _print_model(name)
+    job = replace(job, precision=precision or usual_precision(loaded.generator))
     sampler = completing(loaded.generator, several=num > 1, **how.given)
     for remark in remarks:
         print(remark)

@@ -32,6 +32,7 @@ from r2flow.errors import InputError, check_folder
 if TYPE_CHECKING:
     from r2flow.model.checkpoint import Checkpoint
     from r2flow.reports.pages import Page
+    from r2flow.reports.tables import Row
 
 
 def _finish(page: "Page", out: Path, parts: int) -> None:
@@ -93,16 +94,23 @@ def solvers(
     problems: Annotated[
         str | None, Option(help="Test problems by name, or none. Default: all.")
     ] = None,
+    seconds: Annotated[
+        float, Option(min=1, help="Time for more solvers, scans and repetitions.")
+    ] = 60,
 ) -> None:
     """Compare solvers by error against run time, on test problems with exact solutions and on a
     trained flow.
 
-    The page lists the best sampler for each error as a command.
+    A first table of usual solvers on one scan comes soon. The page lists the best sampler for each
+    error as a command, and what scans of this flow can leave out.
     """
+    import time
+
     from r2flow.flow.problems import PROBLEMS
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.progress import Bar
     from r2flow.reports import solvers as measuring
+    from r2flow.reports.savings import savings
 
     where = choose_device(draw.device)
     methods = samplers.split(",") if samplers else measuring.METHODS
@@ -117,16 +125,31 @@ def solvers(
         )
     check_folder(out)
     logging.getLogger("r2flow.flow").setLevel(logging.ERROR)  # the report counts failed scans
+    until = math.inf if samplers else time.monotonic() + seconds
     flow = None
+    saved: list[Row] = []
+    first: list[Row] = []
     if model is not None:
         loaded = load_checkpoint(model, where)
-        how = (draw.num, draw.seed, draw.batch_size)
-        with Bar("measuring", draw.num * 512, "reference evaluations") as advance:
-            flow = measuring.checkpoint_subject(loaded, model, *how, progress=advance)
-        subjects.append(flow)
+        flow = measuring.checkpoint_subject(loaded, model, 1, draw.seed, steps=32, tolerance=1e-5)
+        usual = measuring.configurations(
+            methods if samplers else measuring.USUAL, budgets, measuring.TOLERANCES[:2]
+        )
+        first = measuring.measure([flow], usual)
+        print(*measuring.flow_text(first, flow), sep="\n\n", end="\n\n", flush=True)
+        saved = savings(loaded.generator, min(draw.num, 4), draw.seed)
+        num = measuring.affordable(first, chosen, (until - time.monotonic()) / 2)
+        num = min(num, draw.num)
+        if num > 0:
+            with Bar("measuring", num * 512, "reference evaluations") as advance:
+                flow = measuring.checkpoint_subject(
+                    loaded, model, num, draw.seed, draw.batch_size, progress=advance
+                )
+            subjects.insert(0, flow)
+            first = []
     with Bar("measuring", len(subjects) * len(chosen), "solutions") as advance:
-        rows = measuring.measure(subjects, chosen, advance)
-    page = measuring.solvers_page(rows, flow, budgets, {"scans": draw.seed}, where)
+        rows = first + measuring.measure(subjects, chosen, advance, until)
+    page = measuring.solvers_page(rows, flow, budgets, {"scans": draw.seed}, where, saved)
     _finish(page, out, -2)  # without the long table
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import typer
 
 from r2flow import __version__
-from r2flow.cli import data, draw, evaluate, files, reports, train, view  # noqa: F401 (each registers its verbs)
+from r2flow.cli import ablate, data, draw, evaluate, files, reports, train, view  # noqa: F401 (each registers its verbs)
 from r2flow.cli.app import app
 from r2flow.errors import (
     InputError,

@@ -319,11 +319,13 @@ class ScanDataModule(L.LightningDataModule):
             InputError: the batch cannot be shared by the devices and accumulated parts.
         """
         source, _ = self._ready()
-        rank, ranks = self.ranks
-        share = self.share(self.trainer) if self.trainer else self.batch_size
         images = max(len(source) // self.batch_size, 1) * self.batch_size
-        sampler = RunSampler(self._order(source), images, rank, ranks, self._place)
-        return self._loader(self._dataset(source, "training"), sampler, share)
+        order = self._order(source)
+        dataset = self._dataset(source, "training")
+        if self.trainer is None:  # a loader by itself, whatever runs it later
+            return self._loader(dataset, RunSampler(order, images), self.batch_size)
+        sampler = RunSampler(order, images, *self.ranks, self._place)
+        return self._loader(dataset, sampler, self.share(self.trainer))
 
     def share(self, trainer: L.Trainer) -> int:
         """Images of a batch on each device, of each accumulated part.
@@ -341,8 +343,7 @@ class ScanDataModule(L.LightningDataModule):
 
     def _place(self) -> tuple[int, int]:
         """The next k of the run, and the number of images of this epoch before it."""
-        if self.trainer is None:
-            return 0, 0
+        assert self.trainer is not None
         batch = self.batch_size // self.trainer.accumulate_grad_batches
         done = self.trainer.fit_loop.epoch_loop.batch_progress.current.ready
         return self.trainer.global_step * self.batch_size, done * batch
@@ -389,7 +390,8 @@ class ScanDataModule(L.LightningDataModule):
         # scans than ranks, every rank takes all scans; otherwise the remainder is left out.
         if len(source) < ranks:
             rank, ranks = 0, 1
-        sampler = RunSampler(range(len(source)), len(source) - len(source) % ranks, rank, ranks)
+        count = len(source) - len(source) % ranks
+        sampler = RunSampler(range(len(source)), count, rank, ranks, lambda: (0, 0))
         return self._loader(self._dataset(source, "validation", whole), sampler, batch_size)
 
     def _loader(

@@ -13,7 +13,13 @@ from r2flow.data.options import SourceOptions
 from r2flow.data.reading import Reading, lacks_reflectance, leaving_out
 from r2flow.data.sources import ScanFiles, ScanSource, warn_of_other_sensor
 from r2flow.errors import InputError, warn_odd
-from r2flow.lidar.scan_files import FIRM_ENDINGS, LOOSE_ENDINGS, conversion_of, scan_ending
+from r2flow.lidar.scan_files import (
+    FIRM_ENDINGS,
+    LOOSE_ENDINGS,
+    TABLE_ENDINGS,
+    conversion_of,
+    scan_ending,
+)
 from r2flow.store import manifest_of
 
 log = logging.getLogger(__name__)
@@ -25,6 +31,20 @@ ODOMETRY_SPLIT = {
     "test": tuple(range(11, 22)),
 }
 OBJECT_SPLIT = {"train": ("training",), "test": ("testing",)}
+# OpenPCDet's split of PandaSet.
+_PANDASET_HELD = {
+    "validation": (
+        3, 11, 20, 21, 27, 42, 43, 45, 51, 55, 56, 57, 59, 73, 78, 80, 94, 97, 101, 109,
+    ),
+    "test": (
+        1, 4, 8, 13, 17, 29, 32, 53, 54, 62, 65, 68, 70, 72, 74, 86, 90, 103, 110, 112,
+        115, 149,
+    ),
+}  # fmt: skip
+PANDASET_SPLIT = {
+    "train": tuple(set(range(159)).difference(*_PANDASET_HELD.values())),
+    **_PANDASET_HELD,
+}
 
 
 if TYPE_CHECKING:
@@ -201,6 +221,16 @@ def nuscenes(root: Path) -> list[Drive]:
             logs.setdefault(file.partition("__")[0], []).append((file, path))
     return [
         Drive(log, tuple(path for _, path in sorted(scans))) for log, scans in sorted(logs.items())
+    ]
+
+
+def pandaset(root: Path) -> list[Drive]:
+    """`NNN/lidar/FF.pkl.gz` with poses.json and timestamps.json beside them, or one drive."""
+    folders = [f for f in (root, root / "lidar", *sorted(root.glob("*/lidar"))) if f.is_dir()]
+    return [
+        Drive(folder.resolve().parent.name, _files(folder, TABLE_ENDINGS))
+        for folder in folders
+        if folder.resolve().name == "lidar"
     ]
 
 

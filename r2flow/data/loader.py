@@ -16,6 +16,7 @@ from r2flow.data.sources import ScanSource
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import FAR, Encoding, wrong_with
 from r2flow.lidar.sensors import Sensor
+from r2flow.processes import rank_and_world_size
 
 Item = dict[str, Tensor]
 Further = Callable[
@@ -130,22 +131,29 @@ class RunSampler(DistributedSampler[Key]):
     Args:
         order: Maps k to a scan.
         images: Number n of images of an epoch, on all ranks.
+        rank, ranks: 0 ranks: those of the process group that runs.
         place: Gives the next k of the run, and the number of images of this epoch before it, which
-            a resumed run skips.
+            a resumed run skips; None: the first k of the epoch that `set_epoch` names.
     """
 
     order: Order
     images: int
     rank: int = 0
-    ranks: int = 1
-    place: Callable[[], tuple[int, int]] = lambda: (0, 0)
+    ranks: int = 0
+    place: Callable[[], tuple[int, int]] | None = None
+    epoch: int = 0  # as Lightning sets it by `set_epoch`; `place` does not depend on it
+
+    def _share(self) -> tuple[int, int]:
+        return (self.rank, self.ranks) if self.ranks else rank_and_world_size()
 
     def __len__(self) -> int:
-        return self.images // self.ranks
+        _, ranks = self._share()
+        return self.images // ranks
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
-        first, done = self.place()
-        for k in range(first + self.rank, first + self.images - done, self.ranks):
+        first, done = self.place() if self.place else (self.epoch * self.images, 0)
+        rank, ranks = self._share()
+        for k in range(first + rank, first + self.images - done, ranks):
             yield k, self.order[k]
 
 

@@ -96,6 +96,13 @@ SOURCES: Registry[SourceKind] = Registry(
     odometry=Layout(layouts.odometry, layouts.ODOMETRY_SPLIT, levels=100),
     object=Layout(layouts.kitti_object, layouts.OBJECT_SPLIT, levels=100),
     nuscenes=Layout(layouts.nuscenes, sensor="hdl32e", reflectance_scale=255.0, levels=255),
+    pandaset=Layout(
+        layouts.pandaset,
+        layouts.PANDASET_SPLIT,
+        sensor="pandar64",
+        reflectance_scale=255.0,
+        levels=255,
+    ),
     folder=Layout(layouts.folder),
 )
 
@@ -394,7 +401,8 @@ def read(
     sensor: Sensor | str | None = None,
     reflectance_scale: float | None = None,
     columns: Sequence[str] | None = None,
-) -> Tensor:
+) -> tuple[Tensor, Sensor]:
+    """The image of `r2flow.read` and its sensor."""
     scans = describe(path)
     if scans.file is None:
         raise InputError(f"{path} is a folder: r2flow.data.opening.open_scans opens it.")
@@ -402,5 +410,8 @@ def read(
     reading = reading_for([scans], sensor=sensor, estimate_scale=True, **fields)
     reading = replace(reading, on_bad_scan="error", within_limits=True)
     own_size = sensor is None and read_range_image(scans.file) is not None
-    image = torch.from_numpy(open_scans(scans, reading, own_size=own_size).source[0])
-    return image if len(image) > 1 else torch.cat([image, torch.zeros_like(image)])
+    opened = open_scans(scans, reading, own_size=own_size)
+    image = torch.from_numpy(opened.source[0])
+    if len(image) == 1:
+        image = torch.cat([image, torch.zeros_like(image)])
+    return image, opened.sensor

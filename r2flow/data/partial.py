@@ -45,6 +45,7 @@ FROM, THROUGH = (
     "in Python Checkpoint.through of such a sensor, uses them with densify",
 )
 
+Sight = Callable[[Path, Points], Partial]  # the image of the points of a scan of this name
 Opened = tuple[list["PartialScan"], list[str]]  # scans, and lines about their sensors
 
 
@@ -137,51 +138,8 @@ def _files(
             read_points(points[number], reading.columns)
             for number in spread(len(points), LOOKED_AT)
         ]
-        own = SENSORS[target.name] if target.name in SENSORS else target  # noqa: SIM401
-        doubt = other_sensor(scans, source or own)
-        if not source and not doubt and own.shape[0] < target.shape[0]:
-            source = own  # fewer beams than rows of the completions
-        same = doubt is None
-        if source:
-            same = source.shape[0] >= target.shape[0] and source.resized(*target.shape).same_image(
-                target
-            )
-        known = source or (target if same else None)
-        try:
-            fired = sensor_of(scans, known)
-        except InputError as error:
-            raise InputError(
-                f"{spec}: the sensor of the scans is not known, name it by {FROM}: {error}"
-            ) from None
-        if (
-            not stored
-            and not warn_of_frame(points[0], scans)
-            and source
-            and doubt
-            and not doubt.finer
-        ):
-            fits = f"; they fit {doubt.name}" if doubt.name else ""
-            warn_odd(
-                points[0], f"sensor {source.name} does not fit these scans: {doubt.seen}{fits}"
-            )
-        of_sensor = known.reflectance_scale if known else None
-        usual = described.scale(of_sensor) if described.options.name != FOLDER or of_sensor else 0.0
-        full = scale or (1.0 if stored else full_reflectance(scans, usual) or usual) or 1.0
-        strict = scale is not None or full in FULL_REFLECTANCE
-        as_own = same and fired.columns >= FEWER * target.columns
-        by_points = partial(
-            _read_points,
-            reading=reading,
-            fired=None if as_own else fired,
-            scale=full,
-            strict=strict,
-        )
-        if not as_own:
-            name = source.name if source else (doubt and doubt.name) or "a sensor"
-            lines += _described(spec, replace(fired, name=name), target, turns=True)
-            whole = _seeing_all(source or fired, target)
-        if not (scale or stored) and full != usual and (of_sensor or full not in SURE):
-            warn_odd(points[0], DIVIDED % full)
+        see, lines, whole = sight(described, points[0], scans, reading, source, scale)
+        by_points = lambda path: see(path, read_points(path, reading.columns))  # noqa: E731
     elif source and not source.same_image(target):
         lines += _described(spec, source, target)
         whole = _seeing_all(source, target)
@@ -194,6 +152,59 @@ def _files(
         return PartialScan(name, ending, read, path.read_bytes, path, path in images, whole)
 
     return [opened(path) for path in paths], lines
+
+
+def sight(
+    described: Described,
+    path: Path,
+    scans: list[Points],
+    reading: Reading,
+    source: Sensor | None,
+    scale: float | None = None,
+) -> tuple[Sight, list[str], Sensor | None]:
+    """How scans of one sensor are seen as images of the model's, lines about the sensor, and a
+    view that keeps all its beams, if the model's does not.
+
+    It is found from a few scans; `path` names them. For the others see `open_partial`.
+    """
+    target = reading.sensor
+    stored = described.stored
+    spec = described.label
+    own = SENSORS[target.name] if target.name in SENSORS else target  # noqa: SIM401
+    doubt = other_sensor(scans, source or own)
+    if not source and not doubt and own.shape[0] < target.shape[0]:
+        source = own  # fewer beams than rows of the completions
+    same = doubt is None
+    if source:
+        same = source.shape[0] >= target.shape[0] and source.resized(*target.shape).same_image(
+            target
+        )
+    known = source or (target if same else None)
+    try:
+        fired = sensor_of(scans, known)
+    except InputError as error:
+        raise InputError(
+            f"{spec}: the sensor of the scans is not known, name it by {FROM}: {error}"
+        ) from None
+    if not stored and not warn_of_frame(path, scans) and source and doubt and not doubt.finer:
+        fits = f"; they fit {doubt.name}" if doubt.name else ""
+        warn_odd(path, f"sensor {source.name} does not fit these scans: {doubt.seen}{fits}")
+    of_sensor = known.reflectance_scale if known else None
+    usual = described.scale(of_sensor) if described.options.name != FOLDER or of_sensor else 0.0
+    full = scale or (1.0 if stored else full_reflectance(scans, usual) or usual) or 1.0
+    strict = scale is not None or full in FULL_REFLECTANCE
+    as_own = same and fired.columns >= FEWER * target.columns
+    fired_by = None if as_own else fired
+    see = partial(_seen, reading=reading, fired=fired_by, scale=full, strict=strict)
+    lines = []
+    whole = None
+    if not as_own:
+        name = source.name if source else (doubt and doubt.name) or "a sensor"
+        lines = _described(spec, replace(fired, name=name), target, turns=True)
+        whole = _seeing_all(source or fired, target)
+    if not (scale or stored) and full != usual and (of_sensor or full not in SURE):
+        warn_odd(path, DIVIDED % full)
+    return see, lines, whole
 
 
 def _images(
@@ -264,11 +275,11 @@ def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -
     return lines
 
 
-def _read_points(
-    path: Path, reading: Reading, fired: Sensor | None, scale: float, strict: bool
+def _seen(
+    path: Path, points: Points, reading: Reading, fired: Sensor | None, scale: float, strict: bool
 ) -> Partial:
-    """Read points of the model's sensor or, with `fired`, of another sensor."""
-    target, points = reading.sensor, read_points(path, reading.columns)
+    """The image of points of the model's sensor or, with `fired`, of another sensor."""
+    target = reading.sensor
     if fired is None and reading.projection == "unfolding":
         points = points.with_lost_rays()
     strength = None  # reflectance in [0, 1]; None if the file has none, or only 0

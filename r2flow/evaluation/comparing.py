@@ -48,6 +48,9 @@ class Comparison:
         return self.name if self.kind == "judged" else f"{self.kind}: {self.name}"
 
 
+Comparisons = Sequence[Comparison]
+
+
 def pairs_of(
     real: ScanSet,
     judged: Mapping[str, ScanSet],
@@ -69,7 +72,7 @@ def pairs_of(
     return pairs
 
 
-def with_equal_panels(comparisons: Sequence[Comparison]) -> list[Comparison]:
+def with_equal_panels(comparisons: Comparisons) -> list[Comparison]:
     """Leave reflectance out of every panel's mean if a set lacks it.
 
     All are then means of the same lines.

@@ -9,7 +9,7 @@ with c by FFT along the rows. The test compares the distances of generated and r
 Meehan et al. (2020), "A non-parametric test to detect data-copying in generative models".
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from r2flow.data.sets import ScanSet
 from r2flow.errors import InputError
-from r2flow.evaluation.comparing import Comparison
+from r2flow.evaluation.comparing import Comparison, Comparisons
 from r2flow.evaluation.measuring import MetricResult, Work, bar
 from r2flow.evaluation.sets import HALVES
 from r2flow.lidar.encoding import Encoding
@@ -50,14 +50,8 @@ def _described(
             advance(len(images))
 
 
-class Nearest:
-    """Nearest scan of a training set for each scan of a set, among those compared so far.
-
-    Attributes:
-        numbers: Indices of scans with returns, (N,).
-        squared: d^2 to the nearest training scan, (N,).
-        neighbours: Index of this training scan.
-        turns: Its shift u in cells, or -1 - u if mirrored first.
+class _Nearest:
+    """Distances of the scans of a set, those with returns, to the training scans compared so far.
 
     Raises:
         InputError: No scan has a return.
@@ -70,76 +64,52 @@ class Nearest:
             raise InputError(
                 f"none of the {len(scans)} scans of {scans.label} has a return to compare."
             )
-        self.scans = scans
         self.training = training
-        self.numbers = np.flatnonzero(usable.cpu().numpy())
-        self.squared = x.new_full((len(self.numbers),), torch.inf)
-        self.neighbours = torch.zeros_like(self.squared, dtype=torch.long)
-        self.turns = torch.zeros_like(self.neighbours)
         self._x = x[usable]
-        self._width = x.shape[2]
+        self._squared = self._x.new_full((len(self._x),), torch.inf)  # d^2 to the nearest, (N,)
         self._spectra = -2 * torch.fft.rfft(self._x).conj().permute(2, 0, 1).contiguous()
 
-    def approach(self, y: Tensor, first: int) -> None:
-        """Update with training scans `first`, `first + 1`, ..., (M, h, w).
-
-        A scan of NaN is never nearest.
-        """
-        m = len(y)
+    def approach(self, y: Tensor) -> None:
+        """Update with more training scans, (M, h, w); a scan of NaN is never nearest."""
+        width = y.shape[2]
         both = torch.cat([y, y.flip(-1)])
         energy = both.square().sum((1, 2)).nan_to_num(torch.inf)
         spectra = torch.fft.rfft(both.nan_to_num(0.0)).permute(2, 1, 0).contiguous()  # (K, h, 2 M)
-        columns = torch.arange(self._width, device=y.device)
-        block = max(PAIRS.get(y.device.type, 1024) // m, 1)
-        for start in range(0, len(self.numbers), block):
+        columns = torch.arange(width, device=y.device)
+        block = max(PAIRS.get(y.device.type, 1024) // len(y), 1)
+        for start in range(0, len(self._x), block):
             at = slice(start, start + block)
             # -2 c(u), (w, n, 2 M)
-            d = torch.fft.irfft(self._spectra[:, at] @ spectra, n=self._width, dim=0)
+            d = torch.fft.irfft(self._spectra[:, at] @ spectra, n=width, dim=0)
             curve, turns = d.min(0)
             place = (curve + energy).argmin(1)
-            turn = turns.gather(1, place[:, None])
-            shifted = ((turn + columns) % self._width)[:, None]
+            shifted = ((turns.gather(1, place[:, None]) + columns) % width)[:, None]
             turned = both[place].gather(2, shifted.expand(-1, y.shape[1], -1))
             # The curve of a copy has 1e-8, by rounding.
             squared = (self._x[at] - turned).square().mean((1, 2))
-            closer = squared < self.squared[at]
-            turn = torch.where(place < m, turn[:, 0], -1 - turn[:, 0])
-            self.squared[at][closer] = squared[closer]
-            self.neighbours[at][closer] = first + place[closer] % m
-            self.turns[at][closer] = turn[closer]
+            self._squared[at] = self._squared[at].fmin(squared)
 
     @property
     def distances(self) -> ndarray:
         """Distance of each scan to its nearest training scan, (N,)."""
-        return self.squared.double().sqrt().cpu().numpy()
-
-    def match(self, place: int) -> ndarray:
-        """Image of the nearest training scan of the scan at `place`, aligned with that scan."""
-        image = self.training.source[int(self.neighbours[place])]
-        turn = int(self.turns[place])
-        if turn < 0:
-            image = image[..., ::-1]
-            turn = -1 - turn
-        return np.roll(image, -round(turn * image.shape[-1] / self._width), axis=-1)
+        return self._squared.double().sqrt().cpu().numpy()
 
 
 def find_nearest(
     sets: Mapping[str, ScanSet], training: ScanSet, work: Work, device: str = "cpu"
-) -> dict[str, Nearest]:
+) -> dict[str, _Nearest]:
     """Find the nearest training scan of each scan of several sets.
 
     Reads training scans once, without storing them.
     """
-    nearest = {name: Nearest(scans, training, work, device) for name, scans in sets.items()}
-    first = 0
+    nearest = {name: _Nearest(scans, training, work, device) for name, scans in sets.items()}
     for y in _described(training, training, work, device, "reading training scans"):
-        for neighbours in nearest.values():
-            neighbours.approach(y, first)
-        first += len(y)
+        for one in nearest.values():
+            one.approach(y)
     return nearest
 
 
-def copies_result(judged: Nearest, real: Nearest) -> MetricResult:
+def _copies_result(judged: _Nearest, real: _Nearest) -> MetricResult:
     """Median distance to the nearest training scan, and P(a scan's distance < a real scan's).
 
     The latter is 0.5 by chance. Real scans that are training scans are left out. A small p of the
@@ -169,20 +139,20 @@ def copies_result(judged: Nearest, real: Nearest) -> MetricResult:
         "mirrored": True,
         "training scans": len(real.training),
     }
-    sizes = {"real": len(real.numbers), "real_chosen": "all", "generated": len(d)}
+    sizes = {"real": len(real.distances), "real_chosen": "all", "generated": len(d)}
     protocol = asdict(Protocol("copies", "log-range of cells", settings=settings))
     return MetricResult("copies", figures, {**protocol, "sizes": sizes}, None, remarks)
 
 
 def with_copies(
-    comparisons: Sequence[Comparison], nearest: Mapping[str, Nearest], real: Nearest
+    comparisons: Comparisons, nearest: Mapping[str, _Nearest], real: _Nearest
 ) -> list[Comparison]:
-    """Add `copies_result` to each judged set in `nearest`, and that of the real scans to halves."""
+    """Add a result to each judged set in `nearest`, and that of the real scans to halves."""
     of = {("judged", name): neighbours for name, neighbours in nearest.items()}
     of["reference", HALVES] = real
     extended = []
     for row in comparisons:
         judged = of.get((row.kind, row.name))
-        more = [] if judged is None else [copies_result(judged, real)]
+        more = [] if judged is None else [_copies_result(judged, real)]
         extended.append(replace(row, measured=[*row.measured, *more]))
     return extended

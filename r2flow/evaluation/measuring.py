@@ -113,7 +113,7 @@ class MetricResult:
     remarks: Sequence[str] = ()
 
 
-def real_rule(
+def _real_rule(
     metric: ScanMetric, real: ScanSet, protocol: Rules = R2FLOW
 ) -> tuple[Sequence[int], str]:
     """Indices of the real scans for a metric and a description of the choice."""
@@ -141,28 +141,22 @@ def gather_real(
     protocol: Rules = R2FLOW,
 ) -> dict[str, Statistics]:
     """Compute each metric's statistics of the real scans, or read them from the cache."""
-    choices = {name: real_rule(metric, real, protocol) for name, metric in metrics.items()}
-    gathered: dict[str, Statistics] = {}
-    keys: dict[str, str] = {}
-    if cache is not None and real.identity is not None:
-        points = "" if protocol.real == "centre" else f", points {WORDS[protocol.real]}"
-        for name, metric in metrics.items():
-            keys[name] = key_of(metric, real, choices[name][1] + points)
+    points = "" if protocol.real == "centre" else f", points {WORDS[protocol.real]}"
+    gathered = {}
+    keys = {}
+    groups: dict[str, tuple[Sequence[int], dict[str, ScanMetric]]] = {}  # by choice of scans
+    for name, metric in metrics.items():
+        numbers, chosen = _real_rule(metric, real, protocol)
+        if cache is not None and real.identity is not None:
+            keys[name] = key_of(metric, real, chosen + points)
             cached = cache.read(keys[name])
             readers = sum_over_processes(torch.tensor(int(cached is not None)))
-            if (
-                cached is not None and readers == rank_and_world_size()[1]
-            ):  # all processes have read it
+            if cached is not None and readers == rank_and_world_size()[1]:  # of all processes
                 gathered[name] = cached
-    numbers_of = {chosen: numbers for numbers, chosen in choices.values()}
-    for chosen, numbers in numbers_of.items():
-        group = {}
-        for name, metric in metrics.items():
-            if name not in gathered and choices[name][1] == chosen:
-                metric.reset()
-                group[name] = metric
-        if not group:
-            continue
+                continue
+        metric.reset()
+        groups.setdefault(chosen, (numbers, {}))[1][name] = metric
+    for chosen, (numbers, group) in groups.items():
         empty = _update(group, real, numbers, True, work, protocol)
         for name, metric in group.items():
             gathered[name] = Statistics(metric.real_state(), len(numbers), empty, chosen)

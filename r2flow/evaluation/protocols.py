@@ -55,7 +55,7 @@ def _fixed_choice(scans: ScanSet, most: int) -> list[int]:
     return fixed_choice(len(scans), most)
 
 
-def published_choice(scans: ScanSet, most: int) -> list[int]:
+def _published_choice(scans: ScanSet, most: int) -> list[int]:
     """The first `most` scans of Python's `random.Random(0).shuffle`, sorted, as published.
 
     The published evaluation lists KITTI-360's training drives before its test drives.
@@ -74,6 +74,6 @@ def published_choice(scans: ScanSet, most: int) -> list[int]:
 
 R2FLOW = Rules("r2flow", "centre", "centre", None, _fixed_choice, "fixed shuffle, seed 0")
 PAPER = Rules(
-    "paper", "measured", "reference", "reference", published_choice, "Python's shuffle, seed 0"
+    "paper", "measured", "reference", "reference", _published_choice, "Python's shuffle, seed 0"
 )
 PROTOCOLS: Registry[Rules] = Registry("protocol", r2flow=R2FLOW, paper=PAPER)

@@ -131,7 +131,7 @@ def reference_sets(
 
 
 @dataclass(eq=False)
-class Baseline(MadeScans):
+class _Baseline(MadeScans):
     """Scans (2 or 1, H, W) of the baseline `word` of `BASELINES`."""
 
     word: str
@@ -151,7 +151,7 @@ class Baseline(MadeScans):
         encoding = Encoding(self.sensor, reflectance=shape[0] > 1)
         return encoding.decode(standard_normal(shape, 0, "evaluation", number)).numpy()
 
-    def flat_ground(self, number: int) -> ndarray:
+    def _flat_ground(self, number: int) -> ndarray:
         """r = -height / sin e within the sensor's range limits."""
         sensor = self.sensor
         e = sensor.rays()[0].numpy().astype(np.float64)
@@ -160,13 +160,13 @@ class Baseline(MadeScans):
         return np.stack([r, 0.3 * (r > 0)])[: self.training.shape[1]].astype(np.float32)
 
     @cached_property
-    def mean_scan(self) -> ndarray:
+    def _mean_scan(self) -> ndarray:
         """Mean of the training scans, at pixels where more than half of them return."""
         returned = self.training[:, 0] > 0
         mean = self.training.sum(0) / np.maximum(returned.sum(0), 1)
         return np.where(returned.mean(0) > 0.5, mean, 0).astype(np.float32)
 
-    def shuffled_pixels(self, number: int) -> ndarray:
+    def _shuffled_pixels(self, number: int) -> ndarray:
         """Each pixel from a random training scan."""
         rows, columns = np.indices(self.sensor.shape)
         draws = generator(0, "shuffle", number)
@@ -175,10 +175,10 @@ class Baseline(MadeScans):
 
 
 BASELINES = {
-    "noise": Baseline.noise,
-    "flat ground": Baseline.flat_ground,
-    "mean scan": lambda baseline, number: baseline.mean_scan,
-    "shuffled pixels": Baseline.shuffled_pixels,
+    "noise": _Baseline.noise,
+    "flat ground": _Baseline._flat_ground,
+    "mean scan": lambda baseline, number: baseline._mean_scan,
+    "shuffled pixels": _Baseline._shuffled_pixels,
 }
 
 
@@ -187,5 +187,5 @@ def baseline_sets(real: ScanSet, num: int) -> dict[str, ScanSet]:
     training = real.spread(200)[:].numpy()
     sets = {}
     for name in BASELINES:
-        sets[name] = ScanSet(name, Baseline(name, training, real.sensor, range(num)), real.sensor)
+        sets[name] = ScanSet(name, _Baseline(name, training, real.sensor, range(num)), real.sensor)
     return sets

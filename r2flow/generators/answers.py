@@ -53,13 +53,16 @@ class Answers:
         E|m - X| = |m - m_j| + b_j exp(-|m - m_j| / b_j) for X from the Laplace density of j.
         """
         p = self.logits.exp()
-        errors = []
-        for own in self.ranges.split(1, 1):
+        least = torch.full_like(self.returns, torch.inf)
+        best = torch.zeros_like(self.returns, dtype=torch.int64)
+        for k, own in enumerate(self.ranges.split(1, 1)):
             distance = (own - self.ranges).abs()
             spread = self.scales * (-distance / self.scales).exp()
-            errors.append((p * (distance + spread)).sum(1))
-        missing = self.logits <= NEVER / 2
-        return torch.stack(errors, 1).masked_fill(missing, torch.inf).argmin(1, keepdim=True)
+            error = (p * (distance + spread)).sum(1, keepdim=True)
+            better = (error < least) & (self.logits[:, k : k + 1] > NEVER / 2)
+            least = torch.where(better, error, least)
+            best = torch.where(better, k, best)
+        return best
 
 
 def smoothed(e: Tensor, hidden: Tensor, elevations: Tensor) -> Tensor:

@@ -111,6 +111,12 @@ class NetworkFlow(Flow):
             raise InputError(
                 f"the parent's network tells {learned}, and this one learns {self.answer}."
             )
+        network = getattr(parent, "backbone", self.backbone)
+        if network.parametrised != self.backbone.parametrised:
+            raise InputError(
+                f"the parent's network was trained with backbone.{network.parametrised}; it cannot "
+                f"go on with {self.backbone.parametrised}."
+            )
         state = self.state_dict()
         theirs = parent.state_dict()
         weights = {name: theirs[name] for name in theirs if name in state or not _optional(name)}

@@ -1,6 +1,7 @@
 """Candidates and features for every ray, from the nearest measured returns."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -12,6 +13,7 @@ from r2flow.lidar.encoding import ModelSpace
 FEATURES = 31  # of `Surroundings`
 ROW = 8  # size of the vector learned for each row
 STEEP = 3.0  # gain of the elevation that follows it
+_FEW = 128  # rows that are searched one after the other
 _SAME = 2e-4  # radians: tolerance for rows of the same elevation
 # Mean reflectance of returns, of simulated scans, to which scans of other sensors are scaled.
 _REFLECTANCE = 0.265
@@ -59,20 +61,20 @@ class Surroundings(NamedTuple):
         offsets = nearest_returns(returned[:, 0], steps, ring).transpose(0, 2)  # (B, 2, 4, H, W)
         near = offsets[:, 0].isfinite()
         down, across = torch.where(near[:, None], offsets, 0).unbind(1)
-        ranges = _moved(log_r, down, across) * near
-        strengths = _moved(strength, down, across) * near
+        ranges, strengths = _moved(torch.stack([log_r, strength]), down, across) * near
         candidates = [
             torch.stack([ranges, strengths]),
             _between(ranges[:, :2], strengths[:, :2], down.abs()[:, :2]),
             _between(ranges[:, 2:], strengths[:, 2:], across.abs()[:, 2:]),
         ]
-        ranges, strengths = torch.cat(candidates, 2)
+        both = torch.cat(candidates, 2)
         present = torch.cat([near, near.unflatten(1, (2, 2)).all(2)], 1)
-        best = (present.roll(2, 1).int().argmax(1, keepdim=True) + 4) % 6
-        any_present = present.any(1, keepdim=True)
-        guess = torch.where(any_present, ranges.gather(1, best), math.log(10))
+        any_present = near.any(1, keepdim=True)
+        nothing = both.new_tensor([math.log(10), 0])[:, None, None, None, None]
+        guess, mean = first_present(both, present, (4, 5, 0, 1, 2, 3), nothing)
+        ranges, strengths = both
         metres = guess.exp().clamp(space.sensor.min_range, space.sensor.max_range)
-        start = encoded(space, metres, strengths.gather(1, best) * any_present)
+        start = encoded(space, metres, mean)
         relative = ((ranges - guess) * present).clamp(-3, 3)
         features = [
             near,
@@ -171,12 +173,23 @@ def within_reach(known: Tensor) -> Tensor:
     return reach[:, None, :, None]
 
 
+def first_present(values: Tensor, present: Tensor, order: Sequence[int], default: Tensor) -> Tensor:
+    """The first candidate in an order that is present, (..., B, 1, H, W), else `default`.
+
+    Values are (..., B, N, H, W), `present` is (B, N, H, W).
+    """
+    for k in reversed(order):
+        default = torch.where(present[:, k : k + 1], values[..., k : k + 1, :, :], default)
+    return default
+
+
 def _moved(values: Tensor, down: Tensor, across: Tensor) -> Tensor:
-    """Values of an image (B, 1, H, W) at offsets in rows and columns, (B, N, H, W)."""
-    rows, columns = values.shape[2:]
+    """Values of images (2, B, 1, H, W) at offsets in rows and columns, (2, B, N, H, W)."""
+    rows, columns = values.shape[3:]
     row = torch.arange(rows, device=values.device)[:, None] + down.long()
     column = (torch.arange(columns, device=values.device) + across.long()) % columns
-    return values.flatten(1).gather(1, (row * columns + column).flatten(1)).view_as(down)
+    pixel = (row * columns + column).flatten(1).expand(2, -1, -1)
+    return values.flatten(2).gather(2, pixel).view(2, *down.shape)
 
 
 def _between(log_r: Tensor, strength: Tensor, distance: Tensor) -> Tensor:
@@ -201,31 +214,57 @@ def nearest_returns(returned: Tensor, steps: Tensor, ring: bool) -> Tensor:
         steps: See `Surroundings.of`.
         ring: Whether the columns are a full turn.
     """
-    twice = steps.repeat(2, 1).mT[..., None]  # (2, 2 B, 1)
-    above, below = _before(torch.cat([returned, returned.flip(1)]), twice, ring).chunk(2, 1)
-    level = torch.cat([returned, returned.flip(2)]).mT
-    turn = level.shape[1]
-    if ring:  # two turns: the last columns precede the first
-        level = torch.cat([level, level], dim=1)
-    left, right = _before(level, twice.flip(0), False)[:, :, -turn:].mT.flip(0).chunk(2, 1)
+    twice = steps.repeat(2, 1).mT[..., None, None]  # (2, 2 B, 1, 1)
+    pairs = torch.cat([returned, returned.flip(1)])
+    above, below = _before(pairs, twice, turning=False, ring=ring).chunk(2, 1)
+    pairs = torch.cat([returned, returned.flip(2)]).mT
+    left, right = _before(pairs, twice.flip(0), turning=ring, ring=False).mT.flip(0).chunk(2, 1)
     upward = steps.new_tensor([-1, 1])[:, None, None, None]  # the opposite direction of rows
     return torch.stack([above, below.flip(2) * upward, left, right.flip(3) * -upward])
 
 
-def _before(returned: Tensor, steps: Tensor, ring: bool) -> Tensor:
-    """Offsets to the nearest return in the quadrant of previous rows, (2, B, H, W), row by row."""
-    batch, rows, columns = returned.shape
-    device = returned.device
-    missing = torch.full((2, batch, columns), math.inf, device=device)
-    moves = torch.tensor([[-1.0, -1.0], [-1.0, 0.0], [-1.0, 1.0]], device=device)
-    offsets = [missing]
-    state = torch.where(returned[:, 0], 0.0, missing)
-    for row in range(1, rows):
-        ends = state if ring else missing
-        wide = torch.cat([ends[..., -1:], state, ends[..., :1]], -1)
-        candidates = wide.unfold(-1, columns, 1).permute(2, 0, 1, 3) + moves[..., None, None]
-        best = (candidates * steps).square().sum(1).argmin(0)
-        nearest = candidates.gather(0, best.expand(1, 2, *best.shape))[0]
-        offsets.append(nearest)
-        state = torch.where(returned[:, row], 0.0, nearest)
-    return torch.stack(offsets, dim=2)
+def _before(returned: Tensor, steps: Tensor, turning: bool, ring: bool) -> Tensor:
+    """Offsets to the nearest return in the quadrant of previous rows, (2, B, H, W).
+
+    The rows are searched in blocks side by side. Each block begins again from what the previous one
+    found, until nothing changes: two or three times on scans, instead of one after the other.
+
+    Args:
+        turning: Whether the first row follows the last.
+        ring: Whether the first column follows the last.
+    """
+    rows = returned.shape[1]
+    blocks = max(n for n in range(1, math.isqrt(rows) + 1) if rows % n == 0) if rows > _FEW else 1
+    parts = returned.unflatten(1, (blocks, -1)).unbind(2)
+    missing = steps.new_full((2, *parts[0].shape), math.inf)
+    start = missing
+    for _ in range(2 * blocks):  # at most two turns
+        state = start
+        offsets = []
+        for own in parts:
+            offsets.append(state)
+            state = _next(torch.where(own, 0.0, state), steps, ring, missing[..., :1])
+        end = state.roll(1, 2)
+        if not turning:
+            end[:, :, 0] = math.inf
+        if torch.equal(end, start):
+            break
+        start = end
+    return torch.stack(offsets, 3).flatten(2, 3)
+
+
+def _next(state: Tensor, steps: Tensor, ring: bool, missing: Tensor) -> Tensor:
+    """Offsets of a row, (2, ..., W), from those of the previous row."""
+    columns = state.shape[-1]
+    ends = (state[..., -1:], state[..., :1]) if ring else (missing, missing)
+    down, across = torch.cat([ends[0], state, ends[1]], -1).unbind()
+    down = down - 1
+    height = (down * steps[0]).square()
+    best = state.new_full((3, *state.shape[1:]), math.inf)
+    for first, move in enumerate((-1, 0, 1)):
+        part = slice(first, first + columns)
+        aside = across[..., part] + move
+        square = height[..., part] + (aside * steps[1]).square()
+        one = torch.stack([square, down[..., part], aside])
+        best = torch.where(square < best[0], one, best)
+    return best[1:]

@@ -25,6 +25,7 @@ from r2flow.generators.surroundings import (
     RowFeatures,
     Surroundings,
     encoded,
+    first_present,
     gain_of,
     scaled,
     steps_of,
@@ -79,6 +80,7 @@ class TransferFlow(Flow):
         self.sigma = sigma
         inputs = space.shape[0] + FEATURES + RowFeatures.FEATURES
         self.backbone = build_backbone(backbone, space.rays, inputs, 3 * _CANDIDATES + 2)
+        self.backbone.refuse_parametrised(type(self).__name__)
         if not self.backbone.any_size:
             raise InputError(
                 "a transfer flow needs a backbone for any size: give backbone=local, not "
@@ -121,10 +123,9 @@ class TransferFlow(Flow):
         output = self.backbone(t, inputs).float()
         correction = output[:, -1:]
         if self.foreign:
-            raised = inputs.clone()
             # The elevation, among the last inputs.
-            raised[:, ROW - RowFeatures.FEATURES] += STEEP * _RAISED
-            output[:, -2] = self.backbone(t, raised).float()[:, -2]
+            inputs[:, ROW - RowFeatures.FEATURES] += STEEP * _RAISED
+            output[:, -2] = self.backbone(t, inputs).float()[:, -2]
             correction = correction * _FOREIGN
         logits, shifts, scales = output[:, :-2].chunk(3, 1)
         # The interpolations are likelier at first.
@@ -134,7 +135,7 @@ class TransferFlow(Flow):
         near = about.ranges + _SHIFT * shifts[:, :6]
         ranges = torch.cat([near, about.guess + _FREE * shifts[:, 6:]], 1)
         scales = (scales - 4).clamp(max=2).exp() + 1e-3
-        nearest = about.strengths.gather(1, about.there.int().argmax(1, keepdim=True))
+        nearest = first_present(about.strengths, about.there, range(4), about.strengths[:, :1])
         strengths = torch.cat([about.strengths, nearest], 1) + correction
         if not self.training:
             strengths = strengths.clamp(0, 1)

@@ -164,11 +164,11 @@ class Encoding:
 
         Shapes are (..., 2 or 1, H, W) and (..., channels, H, W).
         A range outside the limits is a dropped ray, which becomes exactly -1 in both channels, or
-        nearly under `shifted_log`; values are clipped to [-1, 1].
+        nearly under `shifted_log`; values are clipped to [-1, 1]. NaN stays.
         """
         r = image[..., :1, :, :]
         returned = self._is_return(r)
-        y = self.format.forward(torch.where(returned, r, 0.0))
+        y = self.format.forward(torch.where(returned | r.isnan(), r, 0.0))
         if self.limits == "open":
             # 2 y - 1 rounds y below 1/2, to the least y of a return or below it: keep these.
             kept = self._is_return(self.format.inverse(y))

@@ -1,4 +1,4 @@
-"""Semantic labels of scans: SemanticKITTI's `.label` files and the names of their ids."""
+"""Semantic labels of scans: SemanticKITTI's `.label` files and ids, and PandaSet's."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ from numpy import ndarray
 
 from r2flow.errors import InputError
 from r2flow.files import reading
-from r2flow.lidar.scan_files import LARGEST_FILE, Points
+from r2flow.lidar.scan_files import LARGEST_FILE, TABLE_ENDINGS, Points, pandaset
 
 # SemanticKITTI's ids: name, and the colour in pictures (ground grey to violet, vehicles blue,
 # people red, plants green, buildings and fences brown; moving objects as static ones).
@@ -55,8 +55,12 @@ LABELS = {name.replace(" ", "-"): label for label, (name, _) in CLASSES.items()}
 def labels_beside(scan: str | Path) -> Path | None:
     """The label file of a scan, or None.
 
-    It is `000000.label` next to the scan, or `../labels/000000.label` of `velodyne/000000.bin`.
+    It is `000000.label` next to the scan, or `../labels/000000.label` of `velodyne/000000.bin`; of
+    PandaSet `../annotations/semseg/00.pkl.gz` of `lidar/00.pkl.gz`.
     """
+    if str(scan).endswith(TABLE_ENDINGS):
+        labels = pandaset.labels_of(Path(scan))
+        return labels if labels.is_file() else None
     file = Path(scan).with_suffix(".label")
     folder = file.parent.resolve()
     files = [file]
@@ -70,13 +74,16 @@ def read_labels(path: Path, scan: str | Path, points: Points) -> ndarray:
     """The semantic id of each of a scan's points, (N,) uint16, without dropped rows.
 
     A `.label` file has a uint32 per row of the scan's file, class id in the low 16 bits, instance
-    in the high.
+    in the high. PandaSet's classes become SemanticKITTI's ids.
 
     Raises:
         InputError: The file has not one label a row.
     """
     size = 4 * (len(points.xyz) + points.dropped)
     with reading(path, LARGEST_FILE, "file of labels", least=0):
+        if path.name.endswith(TABLE_ENDINGS):
+            ids = pandaset.read_classes(path, Path(scan))
+            return ids if points.kept is None else ids[points.kept]
         found = path.stat().st_size  # checked first: a file of the wrong size is not loaded
         if found != size:
             raise InputError(

@@ -126,9 +126,9 @@ class ScanMetric(Metric):
                 f"'{self.name}' needs reflectance, which these scans do not have; leave it out."
             )
         if len(scans):
-            self.add_rows(self.rows(scans), real, numbers)
+            self._add_rows(self.rows(scans), real, numbers)
 
-    def add_rows(self, rows: Tensor, real: bool, numbers: Sequence[int]) -> None:
+    def _add_rows(self, rows: Tensor, real: bool, numbers: Sequence[int]) -> None:
         """Add the rows of scans of these numbers to the states."""
         side = 0 if real else 1
         whole = rows.isfinite().all(1)
@@ -157,14 +157,12 @@ class ScanMetric(Metric):
     def real_state(self) -> dict[str, Tensor]:
         """States of the real set, on the CPU and gathered from all processes, for a disk cache."""
         with self.sync_context():
-            states = self.metric_state
-            real: dict[str, Tensor] = {}
-            for name, value in states.items():
-                if name in ("counts", "sums"):
-                    real[name] = value[0].clone()
-                elif name == "real_rows":
-                    real[name] = _joined(value)
-            return {name: value.cpu() for name, value in real.items()}
+            states = {
+                name: _joined(value) if name == "real_rows" else value[0].clone()
+                for name, value in self.metric_state.items()
+                if name in ("counts", "sums", "real_rows")
+            }
+        return {name: value.cpu() for name, value in states.items()}
 
     def load_real_state(self, state: Mapping[str, Tensor]) -> None:
         """Load the states from `real_state`, after `reset`; only on the first process."""

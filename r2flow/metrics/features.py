@@ -25,7 +25,7 @@ FEW = (
 )
 
 
-class FeatureMetric(StoredMetric):
+class _FeatureMetric(StoredMetric):
     """A metric whose rows are a network's features.
 
     Args:
@@ -70,7 +70,7 @@ class FeatureMetric(StoredMetric):
         return scans.features[key]
 
 
-def frechet_distance(
+def _frechet_distance(
     mean_1: Tensor, covariance_1: Tensor, mean_2: Tensor, covariance_2: Tensor
 ) -> float:
     """d^2 = |mu_1 - mu_2|^2 + tr(S_1 + S_2 - 2 (S_1 S_2)^(1/2)) (Dowson and Landau 1982).
@@ -110,7 +110,7 @@ def gaussian(rows: Tensor) -> tuple[Tensor, Tensor]:
     return x.mean(0), x.T.cov()
 
 
-class FrechetDistance(FeatureMetric):
+class FrechetDistance(_FeatureMetric):
     """Frechet distance between features of real and generated scans (Heusel et al. 2017).
 
     The Gaussians have the mean and the unbiased covariance of the features, in float64. The
@@ -129,10 +129,10 @@ class FrechetDistance(FeatureMetric):
     def values(self, real: Tensor, generated: Tensor) -> list[float]:
         if min(len(real), len(generated)) <= self.extractor.dim:
             self.remarks.append(FEW)
-        return [frechet_distance(*gaussian(real), *gaussian(generated))]
+        return [_frechet_distance(*gaussian(real), *gaussian(generated))]
 
 
-class KernelDistance(FeatureMetric):
+class KernelDistance(_FeatureMetric):
     """Unbiased estimate of squared MMD with a cubic kernel, the KID of Binkowski et al. (2018).
 
     MMD^2 = mean_{i != j} k(x_i, x_j) + mean_{i != j} k(y_i, y_j) - 2 mean k(x_i, y_j), k(a, b) =
@@ -154,7 +154,7 @@ def _cubic_kernel(a: Tensor, b: Tensor) -> Tensor:
     return z * (3 + z * (3 + z))  # (z + 1)^3 - 1
 
 
-class Manifold(FeatureMetric):
+class Manifold(_FeatureMetric):
     """Precision, recall, density and coverage of generated scans in a network's feature space.
 
     A set is represented by balls around its scans, with the distance to the k-th nearest neighbour
@@ -202,7 +202,7 @@ def _squared_radii(rows: Tensor) -> Tensor:
     return torch.cat(nearest)
 
 
-class TwoSample(FeatureMetric):
+class TwoSample(_FeatureMetric):
     """Area under the ROC curve of a logistic regression between two sets (Lopez-Paz, Oquab 2017).
 
     Each contiguous half of both sets is scored by the classifier trained on the other half, so that
@@ -269,11 +269,11 @@ def _classifier(real: Tensor, generated: Tensor) -> Callable[[Tensor], Tensor]:
     y = (torch.arange(len(rows)) >= len(real)).double()
     weight = len(y) / 2 / torch.where(y > 0, len(generated), len(real)).double()
     # An L2 penalty of 1 on the weights of standardised features.
-    ridge = torch.eye(x.shape[1], dtype=x.dtype)
-    ridge[-1, -1] = 1e-9
-    w = x.new_zeros(x.shape[1])
+    penalty = torch.ones_like(x[0])
+    penalty[-1] = 1e-9
+    w = torch.zeros_like(penalty)
     for _ in range(25):  # Newton's method
         p = (x @ w).sigmoid()
-        curvature = (x * (weight * p * (1 - p))[:, None]).mT @ x + ridge
-        w = w - torch.linalg.solve(curvature, x.mT @ (weight * (p - y)) + ridge @ w)
+        curvature = (x * (weight * p * (1 - p))[:, None]).mT @ x + penalty.diag()
+        w = w - torch.linalg.solve(curvature, x.mT @ (weight * (p - y)) + penalty * w)
     return lambda rows: with_bias(rows) @ w

@@ -56,7 +56,7 @@ class Scan:
         return normals(self.r, self.sensor)
 
 
-def drop_rate(value: ndarray, missing: ndarray, edges: ndarray) -> ndarray:
+def _drop_rate(value: ndarray, missing: ndarray, edges: ndarray) -> ndarray:
     """Per bin of a value, counts of missing rays and of all, and the image's rays, (3, bins)."""
     lost, _ = np.histogram(value[missing], edges)
     rays, _ = np.histogram(value, edges)
@@ -68,7 +68,7 @@ def _differences(a: ndarray, b: ndarray) -> ndarray:
     return np.abs(a - b)[(a > 0) & (b > 0)]
 
 
-def steps_by_sector(scan: Scan) -> ndarray:
+def _steps_by_sector(scan: Scan) -> ndarray:
     """Histograms of signed r(h, w + 1) - r(h, w) per azimuth sector, (8, 13).
 
     They distinguish left and right.
@@ -88,7 +88,7 @@ def _run_lengths(scan: Scan) -> ndarray:
     return np.asarray(np.nonzero(edges < 0)[1] - np.nonzero(edges > 0)[1])
 
 
-def changes_row(scan: Scan) -> ndarray:
+def _changes_row(scan: Scan) -> ndarray:
     """Per row, pairs of neighbours with exactly one return, all, and the image's, (3, 1024)."""
     returned = scan.r > 0
     changes = (returned != np.roll(returned, -1, -1)).sum(1)[:MOST_ROWS]
@@ -99,19 +99,19 @@ def changes_row(scan: Scan) -> ndarray:
     return counts
 
 
-def drop_range(scan: Scan) -> ndarray:
-    """`drop_rate` per logarithmic bin of range, (3, 12), from 3 m, beyond the ego vehicle.
+def _drop_range(scan: Scan) -> ndarray:
+    """`_drop_rate` per logarithmic bin of range, (3, 12), from 3 m, beyond the ego vehicle.
 
     The range of a missing ray is the mean of its neighbours in the row; gaps over 16 columns are
     not counted.
     """
-    return drop_rate(bridged(scan.r, scan.r > 0), scan.r == 0, DROPS)
+    return _drop_rate(bridged(scan.r, scan.r > 0), scan.r == 0, DROPS)
 
 
-def drop_incidence(scan: Scan) -> ndarray:
-    """`drop_rate` per bin of the angle of incidence, (3, 10), estimated as in `drop_range`."""
+def _drop_incidence(scan: Scan) -> ndarray:
+    """`_drop_rate` per bin of the angle of incidence, (3, 10), estimated as in `_drop_range`."""
     _, cosine = scan.surfaces
-    return drop_rate(bridged(cosine, np.isfinite(cosine)), scan.r == 0, INCIDENCES)
+    return _drop_rate(bridged(cosine, np.isfinite(cosine)), scan.r == 0, INCIDENCES)
 
 
 def _pairs(x: ndarray, returned: ndarray, edges: ndarray, parts: int) -> ndarray:
@@ -133,7 +133,7 @@ def _reflectance_pairs(scan: Scan) -> ndarray:
     return _pairs(scan.q, scan.r > 0, REFLECTANCES, REFLECTANCES_APART)
 
 
-def rate_distance(a: ndarray, b: ndarray) -> float:
+def _rate_distance(a: ndarray, b: ndarray) -> float:
     """Mean |x - y| of rates over bins of counts (missing, all, of images), 0 if empty.
 
     At least the share of a set's rays beyond 100 times the other's in their bin, which have no rate
@@ -151,9 +151,9 @@ def rate_distance(a: ndarray, b: ndarray) -> float:
 
 
 def _row_distance(a: ndarray, b: ndarray) -> float:
-    """`rate_distance` over the rows of the images."""
+    """`_rate_distance` over the rows of the images."""
     rows = (a + b).reshape(3, -1)[1] > 0
-    return rate_distance(a.reshape(3, -1)[:, rows], b.reshape(3, -1)[:, rows])
+    return _rate_distance(a.reshape(3, -1)[:, rows], b.reshape(3, -1)[:, rows])
 
 
 def _reflectance_distance(a: ndarray, b: ndarray) -> float:
@@ -189,11 +189,11 @@ PANEL: dict[str, _Member] = {
     "gradient, elevation": _histogram_of(
         lambda scan: _differences(scan.r[1:], scan.r[:-1]), GRADIENTS
     ),
-    "steps by sector": _Member(steps_by_sector, SECTORS * (len(STEPS) - 1)),
+    "steps by sector": _Member(_steps_by_sector, SECTORS * (len(STEPS) - 1)),
     "run lengths": _histogram_of(_run_lengths, RUNS, weighted=True),
-    "changes per row": _Member(changes_row, 3 * MOST_ROWS, _row_distance),
-    "drop rate by range": _Member(drop_range, 3 * (len(DROPS) - 1), rate_distance),
-    "drop rate by incidence": _Member(drop_incidence, 3 * (len(INCIDENCES) - 1), rate_distance),
+    "changes per row": _Member(_changes_row, 3 * MOST_ROWS, _row_distance),
+    "drop rate by range": _Member(_drop_range, 3 * (len(DROPS) - 1), _rate_distance),
+    "drop rate by incidence": _Member(_drop_incidence, 3 * (len(INCIDENCES) - 1), _rate_distance),
     "surface normals": _histogram_of(lambda scan: scan.surfaces[0], NORMALS),
     "incidence": _histogram_of(lambda scan: scan.surfaces[1], COSINES),
     "range pairs": _Member(_range_pairs, (len(RANGES) - 1) ** 2),

@@ -98,11 +98,11 @@ class Scans:
 
     @cached_property
     def birds_eye(self) -> ndarray:
-        """Bird's-eye histogram of each scan, (B, 100, 100), float64: see `birds_eye_histogram`."""
-        return np.stack([birds_eye_histogram(points.cpu().numpy()) for points in self.points])
+        """Bird's-eye histogram of each scan, (B, 100, 100), float64: see `_birds_eye_histogram`."""
+        return np.stack([_birds_eye_histogram(points.cpu().numpy()) for points in self.points])
 
 
-def birds_eye_histogram(xyz: ndarray) -> ndarray:
+def _birds_eye_histogram(xyz: ndarray) -> ndarray:
     """Histogram of points (N, 3) in the horizontal plane: 100 x 100 bins over +-80 m, (100, 100).
 
     Points with 3 m < r < 70 m are counted. Uses torch's function in float32, as published: its edge

@@ -185,12 +185,13 @@ def poles(s: Returns) -> ndarray:
     pairs = cKDTree(ends.mean(0)).query_pairs(POLE_WIDTH, output_type="ndarray")
     a, b = pairs[np.abs(np.diff(row[pairs])[:, 0]) <= 2].T
     label = _components(len(row), a, b)
-    low = _least(label, np.column_stack([ends.min(0), row, s.far[first]]))
-    high = -_least(label, -np.column_stack([ends.max(0), row]))
+    near, _ = _extremes(label, s.far[first])
+    highest, lowest = _extremes(label, row)
+    corner, opposite = _extremes(np.append(label, label), ends.reshape(-1, 2))
     edges = np.tan(np.deg2rad(s.sensor.row_edges))
-    tall = low[:, 3] * (edges[low[:, 2].astype(int)] - edges[high[:, 2].astype(int) + 1])
-    slim = np.linalg.norm(high[:, :2] - low[:, :2], axis=1) < 0.6
-    return ((low[:, :2] + high[:, :2]) / 2)[slim & (tall >= 1)]
+    tall = near * (edges[highest.astype(int)] - edges[lowest.astype(int) + 1])
+    slim = np.linalg.norm(opposite - corner, axis=1) < 0.6
+    return ((corner + opposite) / 2)[slim & (tall >= 1)]
 
 
 def cars(s: Returns) -> ndarray:
@@ -203,9 +204,9 @@ def cars(s: Returns) -> ndarray:
     across = _near(s, below, 0.7 + s.bins)
     a = np.append(np.flatnonzero(along), np.flatnonzero(across))
     label = _components(len(s.p), a, np.append(s.after[along], below[across]))
-    low = _least(label, np.column_stack([s.above, s.far, s.row, -s.above, s.bins]))
-    foot, near, row, top, column = low.T
-    top = -top
+    foot, top = _extremes(label, s.above)
+    least, _ = _extremes(label, np.column_stack([s.far, s.row, s.bins]))
+    near, row, column = least.T
     held = (near <= REACH) & (foot < 0.5) & (top >= 1) & (top <= 2.2)
     elevation = np.array(s.sensor.elevations)[row.astype(int)]
     held &= elevation <= s.sensor.row_edges[0] - 1.5
@@ -213,8 +214,7 @@ def cars(s: Returns) -> ndarray:
     number, label, count = np.unique(label[at], return_inverse=True, return_counts=True)
     turned = s.z[at, None] * np.exp(-1j * TURNS)
     sides = np.stack([turned.real, turned.imag], 1)
-    low = _least(label, sides)  # (C, 2, turns)
-    high = -_least(label, -sides)
+    low, high = _extremes(label, sides)  # (C, 2, turns) each
     face = np.where(np.abs(low) < np.abs(high), low, high)  # the two sides towards the sensor
     distance = np.abs(sides - face[label]).min(1)
     mean = np.zeros((len(number), len(TURNS)))
@@ -251,8 +251,9 @@ def _components(count: int, a: ndarray, b: ndarray) -> ndarray:
     return connected_components(graph, directed=False)[1]
 
 
-def _least(label: ndarray, values: ndarray) -> ndarray:
-    """Minimum of values (N, ...) per label 0, 1, ..., (labels, ...)."""
-    least = np.full((label.max(initial=-1) + 1, *values.shape[1:]), np.inf)
+def _extremes(label: ndarray, values: ndarray) -> ndarray:
+    """Minimum and maximum of values (N, ...) per label 0, 1, ..., (2, labels, ...)."""
+    least, most = np.full((2, label.max(initial=-1) + 1, *values.shape[1:]), np.inf)
     np.fmin.at(least, label, values)
-    return least
+    np.fmin.at(most, label, -values)
+    return np.stack([least, -most])

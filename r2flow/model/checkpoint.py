@@ -5,21 +5,23 @@ execution.
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from r2flow.data.opening import describe, reading_for
-from r2flow.data.partial import PartialScan, open_partial
+from r2flow.data.opening import Described, describe, reading_for
+from r2flow.data.options import FOLDER as PLAIN
+from r2flow.data.options import SourceOptions
+from r2flow.data.partial import PartialScan, Sight, open_partial, sight
 from r2flow.errors import IN_MEMORY, InputError, check, naming
 from r2flow.files import reading_errors
 from r2flow.generators import Generator, TransferFlow, build_generator
 from r2flow.lidar.encoding import Encoding
+from r2flow.lidar.scan_files import Points, points_in_memory
 from r2flow.lidar.sensors import Sensor, named_sensor
 from r2flow.model.completion import complete
 from r2flow.model.parts import HYPER, NOTES, PREFIX, config_of
@@ -51,6 +53,8 @@ class Checkpoint:
     step: int = 0
     path: Path = Path("unsaved")
     format: str = "r2flow"
+    # By sensor: number of points, model and sight of the last scan that was new.
+    _sights: dict[Any, Any] = field(default_factory=dict, init=False, compare=False)
 
     def __repr__(self) -> str:
         kind = (self.config.get("generator") or {}).get("name", "rectified_flow")
@@ -117,13 +121,13 @@ class Checkpoint:
             ):  # a message's points: read-only or big-endian, which torch does not take
                 images = torch.from_numpy(np.array(images, images.dtype.newbyteorder("=")))
         if isinstance(images, Tensor) and images.ndim == 2:
-            with TemporaryDirectory(prefix=f"{IN_MEMORY} ") as folder:
-                np.save(file := Path(folder, "points.npy"), images.detach().float().cpu())
-                try:
-                    return self.complete(file, state, num, seed, sensor=sensor, **how)
-                except InputError as error:
-                    raise InputError(str(error).replace(str(file), IN_MEMORY)) from None
-        if isinstance(images, str | Path):
+            check(state is None, "points have the states of their rays: give no state.")
+            points = points_in_memory(images.detach().float().cpu().numpy())
+            self, see = self._sight(points, sensor)
+            one = see(Path(IN_MEMORY), points)
+            images = torch.from_numpy(one.image)[None]
+            state = torch.from_numpy(one.state)[None]
+        elif isinstance(images, str | Path):
             check(state is None, "a scan file has the states of its rays: give no state.")
             self, scans, remarks = self.open_partial([str(images)], sensor)
             for lost in remarks[1:]:
@@ -163,10 +167,33 @@ class Checkpoint:
             size = "x".join(map(str, view.shape))
             remarks.append(f"completed in their own view, as {size}, which keeps all their beams")
             return model, scans, remarks
-        if not remarks or not transfers or all(map(self._coarser, specs)):
-            return self, scans, remarks
-        # Another sensor fills other rows.
-        return self.through(self.sensor, numbered=False), scans, remarks
+        other = remarks and not all(map(self._coarser, specs))
+        return self._without_rows() if other else self, scans, remarks
+
+    def _sight(self, points: Points, sensor: Sensor | str | None) -> "tuple[Checkpoint, Sight]":
+        """This model for the sensor of points in memory, and how their points are seen.
+
+        It is kept for scans of the same named sensor and about as many points: finding it takes
+        longer than completing a scan.
+        """
+        number = len(points.xyz)
+        known, *kept = self._sights.get(sensor, (0, self, None))
+        if sensor is None or not 0.75 < known / number < 4 / 3:
+            source = None if sensor is None else named_sensor(sensor)
+            described = Described(IN_MEMORY, SourceOptions(PLAIN, IN_MEMORY))
+            reading = reading_for([], self)
+            see, remarks, _ = sight(described, Path(IN_MEMORY), [points], reading, source)
+            for lost in remarks[1:]:
+                warnings.warn(lost.removeprefix(f"{IN_MEMORY}: "), stacklevel=3)
+            kept = [self._without_rows() if remarks else self, see]
+            self._sights[sensor] = (number, *kept)
+        return tuple(kept)
+
+    def _without_rows(self) -> "Checkpoint":
+        """This model for another sensor, whose beams fill other rows."""
+        if not isinstance(self.generator, TransferFlow):
+            return self
+        return self.through(self.sensor, numbered=False)
 
     def _coarser(self, spec: str) -> bool:
         """Whether r2flow wrote some scans as images of this sensor in another size."""

@@ -1,5 +1,6 @@
 """Cost of backbones: the paper's table II, measured."""
 
+import copy
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,9 +29,8 @@ RULE = (
 )
 
 ATEN = torch.ops.aten
-OPERATIONS: dict[
-    Any, Callable[..., int]
-] = {  # two operations a multiply-accumulate, as the counter of torch
+# Two operations a multiply-accumulate, as torch's counter.
+OPERATIONS: dict[Any, Callable[..., int]] = {
     ATEN.native_group_norm: lambda x, weight, *_, **__: 2 * math.prod(x) * (5 if weight else 4),
 }
 
@@ -75,41 +75,35 @@ def count_macs(model: Backbone) -> int:
     A module may have a method `macs(inputs, output)`, which replaces what is counted in its calls
     outside its children.
     """
-    on_meta = {
-        name: tensor.detach().to("meta")
-        for name, tensor in (*model.named_parameters(), *model.named_buffers())
+    on_meta: dict[int, Any] = {
+        id(tensor): tensor.detach().to("meta") for tensor in (*model.parameters(), *model.buffers())
     }
+    model = copy.deepcopy(model, on_meta)  # without its weights
     x = torch.empty(1, model.in_channels, *model.coords.shape[2:], device="meta")
-    calls: list[
-        list[int]
-    ] = []  # of the modules that are being called: operations before, and those of inner calls
+    # Of the modules that are being called: operations before, and those of inner calls.
+    calls: list[list[int]] = []
     stated: list[int] = []
 
-    def enter(module: nn.Module, inputs: Any) -> None:
+    def enter(module, inputs):
         calls.append([counter.get_total_flops(), 0])
 
-    def leave(module: nn.Module, inputs: Any, output: Any) -> None:
+    def leave(module, inputs, output):
         before, inner = calls.pop()
         operations = counter.get_total_flops() - before
         if calls:
             calls[-1][1] += operations
         if hasattr(module, "macs"):
-            stated.append(int(module.macs(inputs, output)) - (operations - inner) // 2)  # type: ignore[operator]
+            stated.append(int(module.macs(inputs, output)) - (operations - inner) // 2)
 
-    handles = [module.register_forward_pre_hook(enter) for module in model.modules()]
-    handles += [module.register_forward_hook(leave) for module in model.modules()]
-    try:
-        with (
-            torch.inference_mode(),
-            FlopCounterMode(display=False, custom_mapping=OPERATIONS) as counter,
-            _FusedAttention(),  # within the counter, so that it comes first
-        ):
-            torch.func.functional_call(
-                model, on_meta, (torch.empty(1, device="meta"), x), tie_weights=False
-            )
-    finally:
-        for handle in handles:
-            handle.remove()
+    for module in model.modules():
+        module.register_forward_pre_hook(enter)
+        module.register_forward_hook(leave)
+    with (
+        torch.inference_mode(),
+        FlopCounterMode(display=False, custom_mapping=OPERATIONS) as counter,
+        _FusedAttention(),  # within the counter, so that it comes first
+    ):
+        model(torch.empty(1, device="meta"), x)
     return counter.get_total_flops() // 2 + sum(stated)
 
 
@@ -151,11 +145,9 @@ def _cost_of(model: Backbone, repeats: int, device: str) -> Row:
         row["gmac"] = count_macs(model) / 1e9
     if repeats:
         shape = 1, model.in_channels, *model.coords.shape[2:]
-        model, x, t = (
-            model.to(device),
-            torch.randn(shape, device=device),
-            torch.full((1,), 0.5, device=device),
-        )
+        model = model.to(device)
+        x = torch.randn(shape, device=device)
+        t = torch.full((1,), 0.5, device=device)
         with torch.inference_mode():
             seconds = [timed(partial(model, t, x), device)[1] for _ in range(repeats + 1)]
         row["latency_ms"] = 1e3 * median(seconds[1:])  # without the warm-up

@@ -78,9 +78,8 @@ def configuration(config: Row) -> str:
         if key not in ignored and not key.startswith("stage.parent.")
     }
     given = dict(flatten(config))  # a run may resume with other values of these
-    kept |= {
-        key: given.get(key) for key in ("trainer.precision", "stage.parent.step", "data.pairs.of")
-    }
+    for key in ("trainer.precision", "stage.parent.step", "data.pairs.of"):
+        kept[key] = given.get(key)
     parent = config["stage"].get("parent")
     if parent:
         before = read_config(Path(parent["path"]).parent.parent)
@@ -88,11 +87,11 @@ def configuration(config: Row) -> str:
     return json.dumps(kept, sort_keys=True, default=str)
 
 
-def group_rows(groups: Groups) -> list[Row]:
+def _group_rows(groups: Groups) -> list[Row]:
     """One row per group: means of the runs with a value, and the deviation of several."""
     rows = []
     for label, runs in groups.items():
-        row: Row = {"name": label, "n": len(runs)}
+        row = {"name": label, "n": len(runs)}
         for column in _SETTINGS:
             equal = {run.values[column] for run in runs}
             row[column] = equal.pop() if len(equal) == 1 else None
@@ -107,40 +106,33 @@ def group_rows(groups: Groups) -> list[Row]:
 
 def cell(row: Row, column: str) -> str:
     """Format a value: '0.243 ± 0.004' over several runs, '-' if missing, 'nan' if one diverged."""
-    value = row.get(column)
+    value = row[column]
     if value is None:
         return "-"
     if isinstance(value, str):
         return value
     text = f"{value:,}" if isinstance(value, int) else f"{value:.3g}"
     spread = row.get(f"{column}_spread")
-    if spread is not None:
-        text += f" ± {spread:.3g}"
-    return text
+    return text if spread is None else f"{text} ± {spread:.3g}"
 
 
-def tables(groups: Groups) -> dict[str, tuple[list[list[str]], list[str]]]:
-    """(cells, headings) by title: settings of the runs, and results."""
-    rows = group_rows(groups)
+def _tables(groups: Groups) -> dict[str, tuple[list[Row], dict[str, str]]]:
+    """Rows of text and headings by title: settings of the runs, and results."""
+    rows = _group_rows(groups)
+    text = [{key: cell(row, key) for key in row} for row in rows]
     measured = {
         key: heading
         for key, heading in _RESULTS.items()
         if any(row[key] is not None for row in rows)
     }
-    parts = {"Runs": {"n": "n", **_SETTINGS}, "Results": measured}
-    return {
-        title: (
-            [[row["name"], *(cell(row, key) for key in columns)] for row in rows],
-            ["run", *columns.values()],
-        )
-        for title, columns in parts.items()
-    }
+    name = {"name": "run"}
+    return {"Runs": (text, {**name, "n": "n", **_SETTINGS}), "Results": (text, name | measured)}
 
 
 def print_comparison(groups: Groups) -> None:
     """Print the tables, and which runs cannot be compared by their losses."""
-    for title, (cells, headings) in tables(groups).items():
-        print_table(cells, headings, title)
+    for title, (rows, columns) in _tables(groups).items():
+        print_table(rows, columns, title)
         print()
     runs = [run.values for group in groups.values() for run in group]
     compared = ("images", "stage", "loss", "data")
@@ -148,8 +140,7 @@ def print_comparison(groups: Groups) -> None:
     if differ:
         print(
             f"the runs differ in {', '.join(differ)}: compare them at equal steps, or by r2flow "
-            "evaluate, not by their "
-            "losses"
+            "evaluate, not by their losses"
         )
 
 
@@ -158,20 +149,20 @@ def compare_page(groups: Groups) -> Page:
     members = [(label, run) for label, runs in groups.items() for run in runs]
     seeds = {run.label: int(run.config["seed"]) for _, run in members if "seed" in run.config}
     text = []
-    for title, (cells, headings) in tables(groups).items():
-        text += [f"## {title}", table(cells, headings)]
+    for title, (rows, columns) in _tables(groups).items():
+        text += [f"## {title}", table(rows, columns)]
     figures = {}
     if any(run.curves for _, run in members):
         figures["compare"] = curves_figure([(label, run.curves) for label, run in members])
-    rows = [{"group": label, "run": run.label, **run.values} for label, run in members]
+    each = [{"group": label, "run": run.label, **run.values} for label, run in members]
     return Page(
         "compare",
         "Runs compared",
         [*text, _NOTES],
-        group_rows(groups),
+        _group_rows(groups),
         figures,
         seeds,
-        more={"runs": rows},
+        more={"runs": each},
     )
 
 

@@ -1,15 +1,18 @@
 """Completed scans as files and pictures."""
 
 import math
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy import ndarray
 from scipy.spatial import cKDTree
 
 from r2flow import noise
@@ -30,6 +33,8 @@ from r2flow.reports.outputs import recipe_of
 from r2flow.reports.pictures import contact_sheet, save_figure
 from r2flow.reports.view import Panel, write_viewer
 from r2flow.store import Store, manifest_of
+
+_THREADS = 4  # at most: Python's own work is done by one thread at a time
 
 
 @dataclass(frozen=True)
@@ -68,40 +73,87 @@ def write_completed(
         for number, scan in enumerate(scans)
         if not all(path.is_file() for path in files[scan.name])
     ]
-    counts = Counter[str]()
+    rays = np.zeros(len(Ray), int)  # of each state, of scans of points
+    outside = 0
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
-    with Bar("completing", len(left) * job.num, "answers", evaluations=len(left) * batches) as bar:
-        for done, number in enumerate(left):
+    bar = Bar("completing", len(left) * job.num, "answers", evaluations=len(left) * batches)
+
+    def answer(number: int) -> tuple[Partial, Completed]:
+        given = _known_rays(scans[number], job, number)
+        (completed,) = complete(
+            checkpoint,
+            torch.from_numpy(given.image)[None],
+            torch.from_numpy(given.state)[None],
+            job.num,
+            job.seed,
+            sampler=sampler,
+            batch_size=job.batch_size,
+            first=number,
+            precision=job.precision,
+            progress=bar.evaluated,
+        )
+        return given, completed
+
+    def write(number: int, given: Partial, completed: Completed) -> tuple[Partial, Completed]:
+        scan = scans[number]
+        _write(checkpoint, scan, out, files[scan.name], given, completed)
+        return given, completed
+
+    with bar, _threads(checkpoint) as pool:
+        done: Iterable[tuple[Partial, Completed]] = ()
+        if left:
+            first = answer(left[0])  # it shows that the settings are valid
+            store.check()  # commands for other scans add theirs at the same time
+            store.write_manifest(inputs={**manifest_of(out).get("inputs", {}), **inputs})
+            others = pool.map(lambda number: write(number, *answer(number)), left[1:])
+            done = chain([write(left[0], *first)], others)
+        for number, (given, completed) in zip(left, done, strict=True):
             scan = scans[number]
-            given = known_rays(scan, job, number)
-            (completed,) = complete(
-                checkpoint,
-                torch.from_numpy(given.image)[None],
-                torch.from_numpy(given.state)[None],
-                job.num,
-                job.seed,
-                sampler=sampler,
-                batch_size=job.batch_size,
-                first=number,
-                precision=job.precision,
-                progress=bar.evaluated,
-            )
-            if not done:  # the first answer shows that the settings are valid
-                store.check()  # commands for other scans add theirs at the same time
-                store.write_manifest(inputs={**manifest_of(out).get("inputs", {}), **inputs})
             if number < job.pictures:
                 _draw(checkpoint, scan, out, given, completed)
-            _write(checkpoint, scan, out, files[scan.name], given, completed)
             if not completed.evaluations.any():
                 print(
                     f"{scan.name}: everything is known, so nothing was completed; see --from, "
                     "--fill-gaps and --mask"
                 )
-            counts += _count(scan, given)
-            bar.set((done + 1) * job.num)
-    _print_counts(checkpoint, counts)
+            if not scan.image:
+                rays += np.bincount(given.state.ravel(), minlength=len(Ray))
+                outside += given.points.dropped if given.points else 0
+        bar.set(len(left) * job.num)
+    _print_counts(checkpoint, rays, outside)
     skipped = f", {len(scans) - len(left)} there already" if len(left) < len(scans) else ""
     print(f"{len(left)} scan{'' if len(left) == 1 else 's'} written to {out}{skipped}")
+
+
+def _print_counts(checkpoint: Checkpoint, rays: ndarray, outside: int) -> None:
+    """Print what was taken of points, from the number of rays of each state."""
+    share = rays[Ray.EMPTY] / max(rays[Ray.EMPTY] + rays[Ray.RETURN], 1)
+    if share > 0.5:  # 31 % at most of real scans
+        print(
+            f"{share:.0%} of the measured rays have no return: for thinned scans give --fill-gaps"
+        )
+    if rays.any():
+        sensor = checkpoint.sensor
+        rows, columns = sensor.shape
+        print(
+            f"used: the nearest point in each pixel of {rows}x{columns}; {outside:,} outside "
+            f"{sensor.min_range:g}-{sensor.max_range:g} m left out"
+        )
+
+
+@contextmanager
+def _threads(checkpoint: Checkpoint) -> Iterator[ThreadPoolExecutor]:
+    """Threads that read, complete and write a scan each: on a CPU they share its cores.
+
+    A command that is stopped does not wait for the scans that are left.
+    """
+    cores = torch.get_num_threads()
+    count = min(cores, _THREADS) if checkpoint.generator.device.type == "cpu" else _THREADS
+    pool = ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(cores // count,))
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _answer_files(checkpoint: Checkpoint, scan: PartialScan, out: Path, num: int) -> list[Path]:
@@ -133,35 +185,6 @@ def _check_inputs(
     return inputs
 
 
-def _count(scan: PartialScan, given: Partial) -> Counter[str]:
-    """Rays of points with and without a return, and points that are written and left out."""
-    if scan.image:
-        return Counter()
-    used = (given.state == Ray.RETURN).sum()
-    empty = (given.state == Ray.EMPTY).sum()
-    if given.points is None:
-        return Counter(used=int(used), empty=int(empty))
-    kept = len(given.points.xyz)
-    return Counter(used=int(used), empty=int(empty), kept=kept, outside=given.points.dropped)
-
-
-def _print_counts(checkpoint: Checkpoint, counts: Counter[str]) -> None:
-    share = counts["empty"] / max(counts["used"] + counts["empty"], 1)
-    if share > 0.5:  # 31 % at most of real scans
-        print(
-            f"{share:.0%} of the measured rays have no return: for thinned scans give --fill-gaps"
-        )
-    if counts["used"]:
-        sensor = checkpoint.sensor
-        size = "x".join(map(str, sensor.shape))
-        print(
-            f"measured points used: {counts['used']:,}, the nearest in each pixel of {size}; "
-            f"kept: {counts['kept']:,}, {counts['outside']:,} outside "
-            f"{sensor.min_range:g}-{sensor.max_range:g} m "
-            "left out"
-        )
-
-
 def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
     """Whether most unknown rays of each scan lie in sectors without known rays; ignores scans
     without unknown rays.
@@ -170,7 +193,7 @@ def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
     """
     kinds: dict[bool, str] = {}
     for number, scan in enumerate(track(scans, "looking at", "scans")):
-        state = known_rays(scan, job, number).state
+        state = _known_rays(scan, job, number).state
         if (state == Ray.UNKNOWN).any():
             kinds.setdefault(share_in_sectors(state) >= 0.5, scan.name)
     if len(kinds) > 1:
@@ -183,7 +206,7 @@ def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
 
 
 @lru_cache(maxsize=16)  # read the scans of a small folder once
-def known_rays(scan: PartialScan, job: Job, number: int) -> Partial:
+def _known_rays(scan: PartialScan, job: Job, number: int) -> Partial:
     """Known rays of scan `number` that the job's mask keeps; the mask depends only on (seed,
     number).
     """

@@ -2,10 +2,10 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
+from numpy import ndarray
 
 from r2flow import noise
 from r2flow.errors import InputError
@@ -41,7 +41,7 @@ INTERPOLATIONS: dict[str, Rule] = {
 }
 
 
-def kept_rays(task: str, sensor: Sensor, number: int) -> np.ndarray:
+def kept_rays(task: str, sensor: Sensor, number: int) -> ndarray:
     """Rays of scan `number` that a mask keeps, (H, W) bool; depends only on both."""
     draws = noise.generator(0, "condition", number)
     kept = parse_mask(task)(np.ones(sensor.shape, dtype=bool), draws)
@@ -51,7 +51,7 @@ def kept_rays(task: str, sensor: Sensor, number: int) -> np.ndarray:
 
 
 def completion_rows(
-    truths: Sequence[np.ndarray],
+    truths: Sequence[ndarray],
     sensor: Sensor,
     ways: Mapping[str, tuple[Checkpoint, Sampler]],
     tasks: Sequence[str] = TASKS,
@@ -70,15 +70,26 @@ def completion_rows(
         masks = np.stack([kept_rays(task, sensor, number) for number in range(len(real))])
         given = real * masks[:, None]
         state = ray_states(torch.from_numpy(real), torch.from_numpy(masks))
-        answers: dict[str, np.ndarray] = {}  # (scans, answers, channels, H, W) by method
-        for name, rule in INTERPOLATIONS.items():
-            filled = [interpolated(*pair, rule)[None] for pair in zip(given, masks, strict=True)]
-            answers[name] = np.stack(filled)
+        answers = {  # (scans, answers, channels, H, W) by method
+            name: np.stack([interpolated(*pair, rule) for pair in zip(given, masks, strict=True)])[
+                :, None
+            ]
+            for name, rule in INTERPOLATIONS.items()
+        }
         cost = {}
-        how: Any = {"batch_size": batch_size, "progress": progress}
         for name, (checkpoint, sampler) in ways.items():
-            how["sampler"] = sampler
-            results = list(complete(checkpoint, torch.from_numpy(given), state, num, seed, **how))
+            results = list(
+                complete(
+                    checkpoint,
+                    torch.from_numpy(given),
+                    state,
+                    num,
+                    seed,
+                    sampler=sampler,
+                    batch_size=batch_size,
+                    progress=progress,
+                )
+            )
             answers[name] = np.stack([result.images.numpy() for result in results])
             cost[name] = {
                 "evaluations": float(np.mean([r.evaluations.float().mean() for r in results])),

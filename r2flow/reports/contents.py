@@ -16,7 +16,7 @@ def describe(path: str | Path) -> dict[str, Any]:
     model = name_of(loaded.path)
     config = {key: value for key, value in loaded.config.items() if key != "published"}
     generator = loaded.generator
-    about: dict[str, Any] = {}
+    about = {}
     if model:
         about = {"model": model, "samples": MODELS[model].about, "licence": MODELS[model].licence}
     if generator.unconditional or generator.takes_condition:

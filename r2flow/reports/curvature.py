@@ -23,6 +23,8 @@ _COLUMNS = {
     "integral": "int s dt",
     "integral_normalised": "bend: int s dt / length^2",
 }
+Flows = Mapping[str, Straightness]  # by label
+
 _TIME = "t  (0 noise, 1 data)"
 
 
@@ -57,17 +59,12 @@ def measure_paths(
     return Straightness(parts[0].t, s, squared_length, bends[order], trajectories[order])
 
 
-def curvature_rows(flows: Mapping[str, Straightness]) -> list[Row]:
+def _curvature_rows(flows: Flows) -> list[Row]:
     """s(t) per checkpoint and time, mean over scans, unnormalised and over |d|^2."""
     rows = []
     for label, flow in flows.items():
-        means = zip(
-            flow.t.tolist(),
-            flow.s.mean(0).tolist(),
-            flow.s_normalised.mean(0).tolist(),
-            strict=True,
-        )
-        for t, s, normalised in means:
+        means = torch.stack([flow.t, flow.s.mean(0), flow.s_normalised.mean(0)], 1)
+        for t, s, normalised in means.tolist():
             rows.append({"checkpoint": label, "t": t, "s": s, "s_normalised": normalised})
     return rows
 
@@ -82,7 +79,7 @@ def summary(label: str, flow: Straightness) -> Row:
     }
 
 
-def curvature_text(flows: Mapping[str, Straightness]) -> list[str]:
+def curvature_text(flows: Flows) -> list[str]:
     """Text: definition of s(t), and the table of flows."""
     first = next(iter(flows.values()))
     about = (
@@ -97,7 +94,7 @@ def curvature_text(flows: Mapping[str, Straightness]) -> list[str]:
     return [about, table([summary(*flow) for flow in flows.items()], _COLUMNS)]
 
 
-def curvature_figure(flows: Mapping[str, Straightness]) -> Figure:
+def curvature_figure(flows: Flows) -> Figure:
     """Plot s(t), mean over scans, unnormalised and over |d|^2: one line per checkpoint."""
     plain = {label: (flow.t, flow.s.mean(0)) for label, flow in flows.items()}
     normalised = {label: (flow.t, flow.s_normalised.mean(0)) for label, flow in flows.items()}
@@ -108,7 +105,7 @@ def curvature_figure(flows: Mapping[str, Straightness]) -> Figure:
     return lines_figure(plots, 2)
 
 
-def trajectories_figure(flows: Mapping[str, Straightness]) -> Figure:
+def trajectories_figure(flows: Flows) -> Figure:
     """Plot the most curved paths, one panel per checkpoint: the paper's figure 8 (b)."""
     figure = blank_figure(1 + 4.2 * len(flows), 4.2)
     panels = figure.subplots(1, len(flows), sharey=True, squeeze=False)[0]
@@ -122,13 +119,13 @@ def trajectories_figure(flows: Mapping[str, Straightness]) -> Figure:
     return figure
 
 
-def curvature_page(flows: Mapping[str, Straightness], seed: int, device: str = "cpu") -> Page:
+def curvature_page(flows: Flows, seed: int, device: str = "cpu") -> Page:
     """Build the page of the straightness of flows."""
     return Page(
         "curvature",
         "Straightness of flows",
         curvature_text(flows),
-        curvature_rows(flows),
+        _curvature_rows(flows),
         {"curvature": curvature_figure(flows), "trajectories": trajectories_figure(flows)},
         {"scans": seed},
         device,

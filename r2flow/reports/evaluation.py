@@ -7,15 +7,15 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from r2flow.evaluation.comparing import Comparison
+from r2flow.evaluation.comparing import Comparison, Comparisons
 from r2flow.reports.pages import Page, Plot, lines_figure
-from r2flow.reports.tables import Row, print_table, table, words
+from r2flow.reports.tables import Row, print_table, table
 from r2flow.reports.verdict import heading, remarks_of, verdict
 
 _SPEED = {"evaluations": "network evaluations a scan", "seconds": "seconds a scan"}
 
 
-def value_rows(comparisons: Sequence[Comparison]) -> list[Row]:
+def _value_rows(comparisons: Comparisons) -> list[Row]:
     """One row per value."""
     rows = []
     for comparison in comparisons:
@@ -36,40 +36,29 @@ def value_rows(comparisons: Sequence[Comparison]) -> list[Row]:
     return rows
 
 
-def print_comparisons(comparisons: Sequence[Comparison]) -> None:
+def print_comparisons(comparisons: Comparisons) -> None:
     """Print the protocol, a table and remarks. Columns are numbered, since names are long."""
-    columns, *lines = _table(comparisons)
+    columns, lines = _table(comparisons)
+    numbers = [str(number) for number in range(1, len(columns))]
     print(_protocol(comparisons))
-    if columns[0] != "set":
-        numbers = list(map(str, range(1, len(columns))))
-        print_table(list(zip(numbers, columns[1:], strict=True)), ("", "its scans : real"))
-        columns = ["", *numbers]
-        print()
-    print_table(lines, columns)
+    print_table(list(zip(numbers, columns[1:], strict=True)), ("", "its scans : real"))
+    print()
+    print_table(lines, ["", *numbers])
     for remark in remarks_of(comparisons):
         print(f"  {remark}")
     print(*verdict(comparisons), sep="\n")
 
 
-def evaluation_page(
-    comparisons: Sequence[Comparison], device: str, seeds: Mapping[str, int]
-) -> Page:
-    """Build the page of an evaluation: table, verdict, sets, protocols, and quality against speed
+def evaluation_page(comparisons: Comparisons, device: str, seeds: Mapping[str, int]) -> Page:
+    """Build the page of an evaluation: table, verdict, and quality against speed
     of models.
     """
-    columns, *lines = _table(comparisons)
-    sets = [
-        (c.name, side, scans.label, len(scans), words(scans.about))
-        for c in comparisons
-        for side, scans in (("real", c.real), ("generated", c.generated))
-    ]
+    columns, lines = _table(comparisons)
     text = [
         _protocol(comparisons),
         table(lines, columns),
         "\n".join(f"- {remark}" for remark in remarks_of(comparisons)),
         *verdict(comparisons),
-        "## Sets",
-        table(sets, ("comparison", "as", "set", "scans", "details, as read")),
     ]
     results = [_plain_comparison(comparison) for comparison in comparisons]
     figures = {}
@@ -78,11 +67,11 @@ def evaluation_page(
         names = [name for name in sampled[0] if "/" in name]
         figures["evaluation_speed"] = speed_figure(sampled, names)
     title = "Generated scans against real ones"
-    rows = value_rows(comparisons)
+    rows = _value_rows(comparisons)
     return Page("evaluation", title, text, rows, figures, seeds, device, {"comparisons": results})
 
 
-def _protocol(comparisons: Sequence[Comparison]) -> str:
+def _protocol(comparisons: Comparisons) -> str:
     used = comparisons[0].measured[0].protocol
     top, bottom = used["elevations"]
     return (
@@ -93,27 +82,19 @@ def _protocol(comparisons: Sequence[Comparison]) -> str:
     )
 
 
-def _table(comparisons: Sequence[Comparison]) -> list[list[str]]:
-    """Headings and lines, with published scaling; the longer of the two runs down."""
-    lines = []
-    for comparison in comparisons:
-        line = {
-            "set": comparison.title,
-            "its scans : real": f"({len(comparison.generated)} : {len(comparison.real)})",
-        }
-        for row in value_rows([comparison]):
+def _table(comparisons: Comparisons) -> tuple[list[str], list[list[str]]]:
+    """Headings and lines: a column for each set, values as published tables scale them."""
+    headings = [""]
+    columns = []
+    for c in comparisons:
+        headings.append(f"{c.title} ({len(c.generated)} : {len(c.real)})")
+        column = {}
+        for row in _value_rows([c]):
             missing = math.isnan(row["value"])
-            line[row["printed_as"]] = "none" if missing else f"{row['printed']:#.4g}"
-        lines.append(line)
-    columns = list(dict.fromkeys(name for line in lines for name in line))
-    cells = [[line.get(name, "") for name in columns] for line in lines]
-    if len(lines) >= len(columns) - 2:
-        return [columns, *cells]
-    headings = ["", *(f"{title} {size}" for title, size, *_ in cells)]
-    return [
-        headings,
-        *map(list, zip(columns[2:], *(values for _, _, *values in cells), strict=True)),
-    ]
+            column[row["printed_as"]] = "none" if missing else f"{row['printed']:#.4g}"
+        columns.append(column)
+    titles = dict.fromkeys(title for column in columns for title in column)
+    return headings, [[title, *(column.get(title, "") for column in columns)] for title in titles]
 
 
 def _plain_comparison(comparison: Comparison) -> Row:

@@ -4,10 +4,7 @@ frame.
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from r2flow.data.sources import spread
@@ -37,62 +34,51 @@ def interpolation(
     rays = checkpoint.sensor.rays()
     evaluations = frames * (sampler.evaluations(checkpoint.generator) or 0)
     with Bar("interpolating", frames, evaluations=evaluations) as bar:
-        how: Any = {"progress": bar.evaluated, "arrived": bar.set}
-        result = interpolate_scans(checkpoint, pair, frames, sampler, **how)
+        result = interpolate_scans(
+            checkpoint, pair, frames, sampler, progress=bar.evaluated, arrived=bar.set
+        )
     warn_unsolved(result.converged)
     images = result.images.nan_to_num(0.0).numpy()
-    weights = result.weights.tolist()
     rows = []
     for number, image in enumerate(images):
         write_scan(image, rays, out / "frames", f"{number:03d}", ("ply", "npy"))
         row = {
             "frame": number,
-            "weight": weights[number],
+            "weight": float(result.weights[number]),
             "returns": int((image[0] > 0).sum()),
             "evaluations": int(result.evaluations[number]),
             "converged": bool(result.converged[number]),
         }
         rows.append(row)
+    captions = [f"w = {row['weight']:.2f}" for row in rows]
     errors = round_trip(checkpoint, result.ends)
     off = ", ".join(f"{error:.2g} m" for error in errors["median_m"].tolist())
     text = [
         f"The flow of {checkpoint.path.name}, step {checkpoint.step}, inverted both scans to noise "
-        "and generated the "
-        "frames from spherical interpolations (slerp) of it. The first and last frames are round "
-        "trips of the scans "
-        f"(median error of the range {off}); their evaluations include both directions.",
+        "and generated the frames from spherical interpolations (slerp) of it. The first and last "
+        f"frames are round trips of the scans (median error of the range {off}); their evaluations "
+        "include both directions.",
         table(rows, {key: key for key in rows[0]}),
     ]
+    titles = [f"real: {name}" for name in names]
     real = pair.numpy()
     first, last = (
-        Panel(f"real: {name}", image[None], rays) for name, image in zip(names, real, strict=True)
+        Panel(title, image[None], rays) for title, image in zip(titles, real, strict=True)
     )
     chosen = spread(len(images), most_images(images.shape) - 2)
-    captions = [f"w = {weights[number]:.2f}" for number in chosen]
-    panels = [first, Panel("between", images[chosen], rays, None, captions), last]
-    write_viewer(out / "interpolation.html", panels, "Interpolation")
-    figures = {"interpolation": interpolation_figure(real, images, weights, rays, names)}
+    between = Panel("between", images[chosen], rays, None, [captions[n] for n in chosen])
+    write_viewer(out / "interpolation.html", [first, between, last], "Interpolation")
+    drawn = spread(len(images), 8)
+    figure = contact_sheet(
+        [real[0], *images[drawn], real[1]],
+        rays,
+        [titles[0], *(captions[number] for number in drawn), titles[1]],
+    )
     return Page(
         "interpolation",
         "Interpolation",
         text,
         rows,
-        figures,
+        {"interpolation": figure},
         device=str(checkpoint.generator.device),
     )
-
-
-def interpolation_figure(
-    real: np.ndarray,
-    frames: np.ndarray,
-    weights: Sequence[float],
-    rays: Tensor,
-    names: Sequence[str],
-) -> Figure:
-    """Contact sheet of the real scans and the frames between them; the first and last frame are
-    round trips.
-    """
-    chosen = spread(len(frames), 8)
-    between = [f"w = {weights[number]:.2f}" for number in chosen]
-    titles = [f"real: {names[0]}", *between, f"real: {names[1]}"]
-    return contact_sheet([real[0], *frames[chosen], real[1]], rays, titles)

@@ -7,8 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
+from numpy import ndarray
 from torch import Tensor
 
 from r2flow.config import as_override
@@ -71,16 +71,17 @@ def write_samples(
     store = FileStore(out, "samples", recipe, endings)
     stale = _stale_files(store, replace)
     rays = checkpoint.sensor.rays()
-    shown: list[np.ndarray] = []
+    shown: list[ndarray] = []
     batches = [range(first, min(first + batch_size, num)) for first in range(0, num, batch_size)]
     left = [part for part in batches if part.start < pictures or stale or store.missing(part)]
     evaluations = len(left) * (sampler.evaluations(generator) or 0)
+    taken: list[int] = []  # evaluations of each scan
     with Bar("sampling", sum(map(len, left)), evaluations=evaluations) as bar:
         done = 0
-        how: Any = {"region": region, "precision": precision, "progress": bar.evaluated}
         for numbers in left:
-            drawn = draw(generator, numbers, seed, sampler, **how)
+            drawn = draw(generator, numbers, seed, sampler, None, region, precision, bar.evaluated)
             warn_unsolved(drawn.converged, numbers.start)
+            taken += drawn.evaluations.tolist()
             while stale:  # the first scan shows that the settings are valid
                 stale.pop().unlink()
             if not (done and store.check()):  # `begin` lists the folder
@@ -91,6 +92,10 @@ def write_samples(
                     shown.append(image)
             done += len(numbers)
             bar.set(done)
+    if taken and not evaluations:  # an adaptive sampler's differ
+        each = ", ".join(map(str, taken[:16]))
+        more = ", ..." if len(taken) > 16 else ""
+        print(f"evaluations of each scan: {each}{more}; mean {sum(taken) / len(taken):.1f}")
     if region is not None:
         shown = [region.crop(torch.from_numpy(image)).numpy() for image in shown]
         rays = region.crop(rays)
@@ -134,7 +139,7 @@ def recipe_of(checkpoint: Checkpoint, seed: int, sampler: Sampler, **more: Any) 
     }
 
 
-def _draw_samples(images: Sequence[np.ndarray], rays: Tensor, out: Path, title: str) -> None:
+def _draw_samples(images: Sequence[ndarray], rays: Tensor, out: Path, title: str) -> None:
     """Write a picture per image, `samples.png` of 8, and `samples.html` of all that fit."""
     for index, image in enumerate(track(images, "drawing", "pages", least=3)):
         save_figure(scan_figure(image, rays, f"sample {index}"), out / f"{index:06d}.png")

@@ -23,7 +23,7 @@ from r2flow.reports.pictures import save_figure
 from r2flow.reports.tables import Row, words
 
 # Markers and dashes distinguish lines without colour.
-STYLES: tuple[dict[str, Any], ...] = tuple(
+STYLES: tuple[Row, ...] = tuple(
     {"marker": marker, "linestyle": dash, "color": f"C{number}"}
     for number, (marker, dash) in enumerate(
         zip("os^DvPX*<>", ("-", "--", "-.", ":", "-") * 2, strict=True)
@@ -57,7 +57,7 @@ def write_page(page: Page, out: Path) -> list[Path]:
     """Write `out/NAME.png ...`, `NAME.pdf`, `NAME.json` and `NAME.md` atomically; returns the
     files.
     """
-    origin = provenance(page)
+    origin = _provenance(page)
     written = []
     for name, figure in page.figures.items():
         for ending in ("png", "pdf"):
@@ -72,11 +72,11 @@ def write_page(page: Page, out: Path) -> list[Path]:
 
 def write_json(page: Page, path: Path) -> None:
     """Write the rows of a page with their provenance."""
-    content = _plain({"origin": provenance(page), "rows": page.rows, **page.more})
+    content = _plain({"origin": _provenance(page), "rows": page.rows, **page.more})
     write_file(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
-def provenance(page: Page) -> dict[str, Any]:
+def _provenance(page: Page) -> Row:
     """Machine, versions, seeds, date and command of a page; only the command has paths."""
     machine = {
         "cpu": _cpu_name(),

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import yaml
 from matplotlib.figure import Figure
 
 from r2flow.data.sets import ScanSet
@@ -25,9 +26,15 @@ from r2flow.reports.curvature import (
 from r2flow.reports.evaluation import sampled_rows, speed_figure
 from r2flow.reports.pages import Page
 from r2flow.reports.pictures import contact_sheet
-from r2flow.reports.printed import COLUMNS, TABLE_I, TABLE_II, Architecture
 from r2flow.reports.tables import Row, shown, table
+from r2flow.reports.verdict import PRINTED
 
+_PRINTED = yaml.safe_load(Path(__file__).with_name("printed.yaml").read_text(encoding="utf-8"))
+# Name in `r2flow.metrics` -> (heading, factor of the printed values).
+COLUMNS = {
+    key: PRINTED.get(key, (key.upper(), 1.0))
+    for key in ("frd", "frid", "fpd", "fpvd", "fsvd", "jsd", "mmd")
+}
 _PROTOCOL = "paper, 10000 scans of 64x1024 against"  # of the printed rows, all scans of KITTI-360
 _MANY = 16  # minimum evaluations of a row to compare with the paper's 256
 
@@ -103,19 +110,19 @@ def paper_page(
         raise InputError(
             f"the results are of other models or checkpoints than {names}: evaluate these."
         )
-    architectures = architecture_rows(runs, evaluated, device)
+    architectures = _architecture_rows(runs, evaluated, device)
     protocols = "; ".join(dict.fromkeys(row["protocol"] for row in evaluated))
     text = [
         f"Generators: {names}.",
         "## Table I: methods and metrics",
-        table_i(evaluated),
+        _table_i(evaluated),
         f"Evaluated rows: {protocols or 'none'}. Printed rows: {_PROTOCOL} kitti_360. Figures with "
         "* are of another "
         "protocol than printed ones, and not comparable.",
         "## Table II: velocity estimators",
         table(architectures, _ARCHITECTURES),
     ]
-    figures = {"figure_7": scans_figure(runs, real)}
+    figures = {"figure_7": _scans_figure(runs, real)}
     metrics = [f"{name}/{name}" for name in COLUMNS]
     metrics = [name for name in metrics if any(name in row for row in evaluated)]
     if metrics:
@@ -138,7 +145,7 @@ def paper_page(
     return Page("paper", title, text, evaluated, figures, {"sampled scans": 0}, device, more)
 
 
-def scans_figure(runs: Sequence[PaperRun], real: ScanSet | None) -> Figure:
+def _scans_figure(runs: Sequence[PaperRun], real: ScanSet | None) -> Figure:
     """Figure 7: a real scan, and the first sample of each generator."""
     images = {}
     if real is not None:
@@ -164,20 +171,19 @@ def read_results(files: Sequence[Path]) -> list[Row]:
     return rows
 
 
-def table_i(rows: Sequence[Row]) -> str:
+def _table_i(rows: Sequence[Row]) -> str:
     """Table I as printed, with evaluated rows below: those of equal evaluations, or the most if
     both are many.
 
     Evaluated rows without a printed row come last.
     """
-    lines: list[Row] = []
+    lines = []
     left = list(rows)
-    for printed in TABLE_I:
-        count = printed.evaluations
-        line = {"method": printed.method, "of": "paper", "evaluations": count}
-        lines.append(line | dict(zip(COLUMNS, printed.figures, strict=True)))
-        same = [row for row in rows if row["role"] == printed.method]
+    for printed in _PRINTED["table_1"]:
+        lines.append({**printed, "of": "paper"})
+        same = [row for row in rows if row["role"] == printed["method"]]
         most = max((row["evaluations"] for row in same), default=0)
+        count = printed["evaluations"]
         if min(count, most) >= _MANY:
             count = most
         below = [row for row in same if row["evaluations"] == count]
@@ -199,7 +205,7 @@ def _evaluated_line(row: Row) -> Row:
     return line
 
 
-def architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], device: str) -> list[Row]:
+def _architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], device: str) -> list[Row]:
     """Table II: one row per 1-RF, with the printed row of equal parameters, and FRD of the most
     evaluations.
     """
@@ -208,12 +214,9 @@ def architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], device: str
         if run.role != "1-RF":
             continue
         config = run.checkpoint.config
-        line = {"backbone": (config["backbone"] or {}).get("name"), **cost(config, 3, device)}
-        printed = same_architecture(line["parameters"])
-        if printed:
-            line["gmac_printed"] = printed.gmac
-            line["latency_printed"] = printed.latency_ms
-            line["frd_printed"] = printed.frd
+        measured = cost(config, 3, device)
+        printed = _same_architecture(measured["parameters"])
+        line = {**printed, **measured, "backbone": (config["backbone"] or {}).get("name")}
         weights = weights_hash(run.checkpoint)
         evaluated = [row for row in rows if row["weights"] == weights and "frd/frd" in row]
         best = max(evaluated, key=lambda row: row["evaluations"], default=None)
@@ -223,11 +226,12 @@ def architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], device: str
     return lines
 
 
-def same_architecture(parameters: int) -> Architecture | None:
-    """The row of table II with this number of parameters, within 0.4 % (the printed 125.5 M are
-    125.2 M).
+def _same_architecture(parameters: int) -> Row:
+    """The printed row of table II with this number of parameters; empty without one.
+
+    Within 0.4 %: the printed 125.5 M are 125.2 M.
     """
-    for row in TABLE_II.values():
-        if abs(parameters - row.parameters) < 4e-3 * row.parameters:
+    for row in _PRINTED["table_2"].values():
+        if abs(parameters - row["parameters"]) < 4e-3 * row["parameters"]:
             return row
-    return None
+    return {}

@@ -25,7 +25,7 @@ class ComparedRun(NamedTuple):
     curves: dict[str, Curve]  # (steps, values) by logged name
 
 
-def find_runs(paths: Sequence[Path]) -> list[Path]:
+def _find_runs(paths: Sequence[Path]) -> list[Path]:
     """Given run folders, and the runs in folders of runs (a chain, a sweep, a sweep of chains).
 
     Other paths, as in `runs/sweep/*`, are skipped if there is any run.
@@ -50,8 +50,8 @@ def find_runs(paths: Sequence[Path]) -> list[Path]:
 
 def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
     """Read all runs; build each network once."""
-    folders = find_runs(paths)
-    costs: dict[str, Row] = {}
+    folders = _find_runs(paths)
+    costs = {}
     runs = []
     for path, label in zip(folders, short_names(folders), strict=True):
         config = read_config(path) or {}

@@ -4,10 +4,11 @@ trained flow.
 
 import math
 import shlex
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import groupby
+from itertools import groupby, product
 from operator import itemgetter
 
 import numpy as np
@@ -33,12 +34,15 @@ from r2flow.noise import Draws
 from r2flow.plugins import loaded_plugins
 from r2flow.reports.backbones import timed
 from r2flow.reports.pages import Page, Plot, lines_figure
+from r2flow.reports.savings import savings_text
 from r2flow.reports.tables import Row, shown, table
 
-METHODS = (*SOLVERS, f"{TORCHDIFFEQ}dopri5")
+USUAL = ("euler", "midpoint", "adams3", "dopri5")  # measured first
+METHODS = (*dict.fromkeys((*USUAL, "exprb43", *SOLVERS)), f"{TORCHDIFFEQ}dopri5")
 TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5)  # of adaptive methods
 _REPEATS = 5  # maximum timed solutions per scan
 _PATIENCE = 0.5  # seconds after which timing stops
+_REFERENCE = 800  # evaluations of a reference solution, about
 _ROUNDING = 1e-9  # smallest error distinguishable from rounding in float64
 _COLUMNS = {
     "problem": "problem",
@@ -133,36 +137,45 @@ def checkpoint_subject(
 
 @torch.inference_mode()
 def measure(
-    subjects: Sequence[Subject], chosen: Mapping[str, Row], progress: Progress = None
+    subjects: Sequence[Subject],
+    chosen: Mapping[str, Row],
+    progress: Progress = None,
+    until: float = math.inf,
 ) -> list[Row]:
     """Measure error, evaluations and seconds of each configuration on each subject, one row each.
 
-    Repetitions are interleaved, so that other load on the machine affects all configurations alike;
-    errors are those of the first repetition.
+    Configurations come in order on all subjects, and then again: other load on the machine affects
+    all alike. Errors are those of the first repetition. After the time `until` (of
+    `time.monotonic`) only the `USUAL` methods are begun; what was not measured has no row.
     """
-    rows = []
+    seconds: dict[tuple[str, str], list[float]] = {}
+    solutions: dict[tuple[str, str], list[Solution]] = {}
     for subject in subjects:
-        seconds: dict[str, list[float]] = {label: [] for label in chosen}
-        solutions: dict[str, list[Solution]] = {}
         subject.velocity(subject.x_0.new_zeros(()), subject.x_0[:1])  # warm up
-        for _ in range(_REPEATS):
-            for label, options in chosen.items():
-                if sum(seconds[label]) >= _PATIENCE:
-                    continue
-                solved = list(_timed_solutions(subject, options))
-                seconds[label] += [taken for _, taken in solved]
-                if label not in solutions:
-                    solutions[label] = [solution for solution, _ in solved]
-                    if progress is not None:
-                        progress()
-        for label, options in chosen.items():
-            row = {
-                "problem": subject.name,
-                "label": label,
-                **_row(subject, options, solutions[label]),
-            }
-            rows.append(row | {"seconds": float(np.median(seconds[label]))})
+    for _, (label, options), subject in product(range(_REPEATS), chosen.items(), subjects):
+        taken = seconds.setdefault((subject.name, label), [])
+        late = time.monotonic() > until and (taken or options["method"] not in USUAL)
+        if late or sum(taken) >= _PATIENCE:
+            continue
+        solved = list(_timed_solutions(subject, options))
+        taken += [seconds_a_scan for _, seconds_a_scan in solved]
+        if (subject.name, label) not in solutions:
+            solutions[subject.name, label] = [solution for solution, _ in solved]
+            if progress is not None:
+                progress()
+    rows = []
+    for subject, (label, options) in product(subjects, chosen.items()):
+        if found := solutions.get((subject.name, label)):
+            row = {"problem": subject.name, "label": label, **_row(subject, options, found)}
+            rows.append(row | {"seconds": float(np.median(seconds[subject.name, label]))})
     return rows
+
+
+def affordable(rows: Sequence[Row], chosen: Mapping[str, Row], seconds: float) -> int:
+    """Number of scans whose reference and configurations take about these seconds."""
+    one = sum(row["seconds"] for row in rows) / sum(row["evaluations"] for row in rows)
+    steps = [options.get("steps", 0) * 4 or 100 for options in chosen.values()]  # at most; about
+    return int(min(seconds, 1e6) / (one * (_REFERENCE + sum(steps))))
 
 
 def _timed_solutions(subject: Subject, options: Row) -> Iterator[tuple[Solution, float]]:
@@ -237,14 +250,19 @@ def solvers_page(
     budgets: Sequence[int],
     seeds: Mapping[str, int],
     device: str = "cpu",
+    saved: Sequence[Row] = (),
 ) -> Page:
-    """Build the report on the rows of `measure`; `subject` is the trained flow, if any."""
+    """Build the report on the rows of `measure`; `subject` is the trained flow, if any.
+
+    `saved` are rows of `r2flow.reports.savings`.
+    """
     text = []
     figures = {}
     groups = {name: list(group) for name, group in groupby(rows, itemgetter("problem"))}
     if subject is not None:
         flow = groups.pop(subject.name)
         text += flow_text(flow, subject)
+        text += savings_text(saved)
         plots = [
             _plot(subject.name, flow, x, y)
             for x in ("evaluations", "seconds")
@@ -253,15 +271,15 @@ def solvers_page(
         figures["solvers"] = lines_figure(plots, 2)
     if groups:
         lines = []
+        scans = next(iter(groups.values()))[0]["scans"]
         for name, group in groups.items():
             best = [best_within(group, budget) for budget in budgets]
             cells = [f"{row['method']} {shown(reached(row))}" if row else "none" for row in best]
             lines.append([name, *cells])
         text += [
             "## Exact problems",
-            f"{rows[0]['scans']} scans each, in float64: the most accurate solver within a number "
-            "of evaluations and "
-            "its median RMS error; none if x_0 has a smaller error.",
+            f"{scans} scans each, in float64: the most accurate solver within a number of "
+            "evaluations and its median RMS error; none if x_0 has a smaller error.",
             table(lines, ["problem", *(f"within {budget}" for budget in budgets)]),
         ]
         plots = [_plot(name, group, "evaluations", "error") for name, group in groups.items()]

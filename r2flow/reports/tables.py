@@ -93,7 +93,7 @@ def words(values: Mapping[str, Any]) -> str:
 
 def _as_text(rows: Rows, columns: Columns) -> list[list[str]]:
     """Headings and cells, line by line."""
-    lines: list[Any] = [columns, *rows]
+    lines = [columns, *rows]
     if isinstance(columns, Mapping):
         lines = [columns.values(), *([row.get(key) for key in columns] for row in rows)]  # type: ignore[union-attr]
     return [[one_line(shown(cell)) for cell in line] for line in lines]

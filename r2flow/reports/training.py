@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy import ndarray
 
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.paths import checkpoints_of
@@ -16,7 +17,7 @@ from r2flow.reports.outputs import what_next, write_samples
 from r2flow.reports.pages import Plot, lines_figure
 from r2flow.reports.pictures import save_figure
 
-Curve = tuple[np.ndarray, np.ndarray]
+Curve = tuple[ndarray, ndarray]
 
 CURVES = {
     "train/loss": "training loss",
@@ -59,7 +60,7 @@ def curves_figure(runs: Sequence[tuple[str, Mapping[str, Curve]]]) -> Figure:
     return lines_figure(plots, 3)
 
 
-def smooth(steps: np.ndarray, values: np.ndarray) -> Curve:
+def smooth(steps: ndarray, values: ndarray) -> Curve:
     """Running mean over a twentieth of the points, at the centre of its steps."""
     width = max(len(values) // 20, 1)
     kernel = np.full(width, 1 / width)

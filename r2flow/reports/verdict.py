@@ -1,9 +1,8 @@
 """Sentences on an evaluation: which sets are as near to the real scans as these to each other."""
 
 import math
-from collections.abc import Sequence
 
-from r2flow.evaluation.comparing import Comparison
+from r2flow.evaluation.comparing import Comparison, Comparisons
 from r2flow.evaluation.sets import AS_MANY, HALVES
 
 _ENOUGH = 100  # least number of scans of a set, or of a half of the real ones, for a verdict
@@ -28,7 +27,7 @@ def heading(metric: str, figure: str) -> tuple[str, float]:
     return figure, 1.0
 
 
-def verdict(comparisons: Sequence[Comparison]) -> list[str]:
+def verdict(comparisons: Comparisons) -> list[str]:
     """One sentence per judged set, the nearest first: its panel next to those of real halves and
     the best baseline.
 
@@ -40,21 +39,21 @@ def verdict(comparisons: Sequence[Comparison]) -> list[str]:
     metric = _HEADLINE if _HEADLINE in biased else next(iter(biased), "")
     values = [pair for pair in _first_values(comparisons, metric) if math.isfinite(pair[0])]
     values.sort(key=lambda pair: pair[0])
-    references = {c.name: (value, c) for value, c in values if c.kind == "reference"}
-    if HALVES not in references:
+    titled = {c.title: (value, c) for value, c in values}
+    halves = titled.get(f"reference: {HALVES}")
+    if halves is None:
         return []
-    halves = references[HALVES]
     baselines = [pair for pair in values if pair[1].kind == "baseline"][:1]
+    best = baselines[0][0] if baselines else math.inf
     title, factor = heading(metric, metric)
     bounds = [f"{c.title} {value * factor:.3g}" for value, c in (halves, *baselines)]
     lines = []
     for value, comparison in values:
         if comparison.kind != "judged":
             continue
-        equal = references.get(comparison.name + AS_MANY)
+        equal = titled.get(f"reference: {comparison.name}{AS_MANY}")
         same = [f"in as many scans as the halves {equal[0] * factor:.3g}"] if equal else []
         near = ", ".join([*same, *bounds])
-        best = baselines[0][0] if baselines else math.inf
         judgement = _judge((value, comparison), equal, halves, best)
         empty = comparison.measured[0].protocol.get("sizes", {}).get("generated_empty")
         if empty:
@@ -96,7 +95,7 @@ def _judge(judged: _Value, equal: _Value | None, halves: _Value, best: float) ->
     return "not distinguishable from real scans by this figure"
 
 
-def remarks_of(comparisons: Sequence[Comparison]) -> list[str]:
+def remarks_of(comparisons: Comparisons) -> list[str]:
     """Remarks on distances that do not rank, and those of the metrics with the sets that they are
     on.
     """
@@ -127,12 +126,12 @@ def remarks_of(comparisons: Sequence[Comparison]) -> list[str]:
     return lines
 
 
-def _distances(comparisons: Sequence[Comparison]) -> dict[str, bool]:
+def _distances(comparisons: Comparisons) -> dict[str, bool]:
     """Names of the metrics that are distances, and whether they are biased."""
     return {m.metric: m.biased for m in comparisons[0].measured if m.biased is not None}
 
 
-def _first_values(comparisons: Sequence[Comparison], metric: str) -> list[_Value]:
+def _first_values(comparisons: Comparisons, metric: str) -> list[_Value]:
     """The first figure of a metric, with its comparison."""
     return [
         (next(iter(m.figures.values())), c)

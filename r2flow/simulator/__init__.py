@@ -35,7 +35,7 @@ def simulate(sensor: Sensor | str, seed: int, index: int) -> SimulatedScan:
     scenes.
     """
     rng = generator(seed, "simulator", index)
-    return observe(draw_scene(rng), named_sensor(sensor), rng)
+    return _observe(draw_scene(rng), named_sensor(sensor), rng)
 
 
 def draw_scene(rng: np.random.Generator) -> Scene:
@@ -43,7 +43,7 @@ def draw_scene(rng: np.random.Generator) -> Scene:
     return StreetBuilder(rng).draw()
 
 
-def observe(scene: Scene, sensor: Sensor, rng: np.random.Generator) -> SimulatedScan:
+def _observe(scene: Scene, sensor: Sensor, rng: np.random.Generator) -> SimulatedScan:
     """Scan a scene with a sensor at its default height above the scene's origin."""
     rays = Rays(lasers_of(sensor), sensor.columns, sensor.height)
     return SimulatedScan(*report(sensor, rays, cast(scene, rays, rng), scene.rig, rng))

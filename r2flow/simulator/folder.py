@@ -14,9 +14,8 @@ from r2flow.simulator import REVISION, simulate
 from r2flow.store import FileStore
 
 KIND = "simulated"
-FORMATS = Registry(
-    "format", bin=".bin", pcd=".pcd", ply=".ply", npy=".npy"
-)  # npy is the range image itself
+# npy is the range image itself.
+FORMATS = Registry("format", bin=".bin", pcd=".pcd", ply=".ply", npy=".npy")
 
 
 class SimulatedFolder(FileStore):
@@ -41,7 +40,10 @@ class SimulatedFolder(FileStore):
         super().__init__(
             folder, KIND, {"simulator": REVISION, "seed": seed, "reading": reading}, endings
         )
-        self.sensor, self.seed, self.formats, self.labels = sensor, seed, formats, labels
+        self.sensor = sensor
+        self.seed = seed
+        self.formats = formats
+        self.labels = labels
         for name in formats:
             FORMATS[name]
         if labels and tuple(formats) == ("npy",):
@@ -52,7 +54,8 @@ class SimulatedFolder(FileStore):
 
     def simulate(self, item: int) -> None:
         scan = simulate(self.sensor, self.seed, item)
-        rays, name = self.sensor.rays(), f"{item:06d}"
+        rays = self.sensor.rays()
+        name = f"{item:06d}"
         write_scan(scan.image, rays, self.folder, name, self.formats)
         if self.labels:
             # In the order of the points; ids are exact in float32.

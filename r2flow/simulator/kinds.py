@@ -10,6 +10,7 @@ from r2flow.simulator.ground import Ground
 from r2flow.simulator.materials import MATERIALS
 from r2flow.simulator.scene import SceneBuilder
 from r2flow.simulator.streets import Footprint, Street
+from r2flow.simulator.tables import TABLES
 
 _Span = tuple[float, float]
 
@@ -35,25 +36,7 @@ class Kind(NamedTuple):
     highway: bool = False  # whether the street is straight, with lines and guard rails
 
 
-# Residential, urban, suburb, highway.
-KINDS = (
-    Kind(
-        0.45, (2.3, 3.5), (1.0, 2.0), (0.5, 4.5), 6.0, (2, 3),
-        0.70, 0.43, 8.75, 0.60, 0.30, 1.5, 1.3, 0.4, 0.75,
-    ),
-    Kind(
-        0.22, (3.2, 5.5), (1.8, 4.0), (0.0, 3.0), 5.0, (3, 5),
-        0.81, 0.47, 5.00, 0.08, 0.10, 5.0, 2.7, 1.0, 0.80,
-    ),
-    Kind(
-        0.25, (2.3, 3.4), (0.0, 2.0), (2.0, 7.0), 12.0, (1, 2),
-        0.61, 0.27, 10, 0.60, 0.22, 0.6, 1.0, 0.2, 0.60,
-    ),
-    Kind(
-        0.08, (6.0, 9.0), (0.0, 0.0), (14, 30), 30.0, (1, 4),
-        0.44, 0.0, 6.25, 0.0, 0.0, 0.0, 5.0, 0.0, 0.0, True,
-    ),
-)  # fmt: skip
+KINDS = tuple(Kind(**kind) for kind in TABLES["kinds"].values())
 
 _TUFTS = 0.02, 0.18  # metres: height of grass and rubble on verges, from and to
 

@@ -12,15 +12,19 @@ empty in some places and full in others.
 
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy import ndarray
 
 from r2flow.lidar.sensors import Sensor
+from r2flow.simulator.tables import TABLES
+
+Arrays = tuple[ndarray, ...]
 
 
 @dataclass(frozen=True, eq=False)  # compared and hashed by identity
-class Lasers:
+class _Lasers:
     """B lasers on a spinning head."""
 
     elevation: ndarray  # inclination E in radians, decreasing, (B,)
@@ -34,73 +38,41 @@ class Lasers:
     straight: bool  # whether laser b fires along the bin centres of image row b
 
 
-# Angles below the horizon in degrees of the lasers of an HDL-64E S2, fitted by z = z_i + s tan E_i
-# to the 64 rings of a drive's scans. Residuals: 0.001 degrees for the upper block, 0.005 for the
-# lower.
-_HDL64E_BELOW = (
-    -1.94, -1.57, -1.30, -0.87, -0.58, -0.18, 0.09, 0.45, 0.80, 1.20, 1.49, 1.83, 2.21, 2.55, 2.87,
-    3.24, 3.54, 3.94, 4.22, 4.59, 4.91, 5.25, 5.61, 5.96, 6.33, 6.68, 7.00, 7.29, 7.68, 8.06, 8.31,
-    8.71, 9.03, 9.57, 10.06, 10.47, 10.96, 11.60, 12.12, 12.56, 13.04, 13.48, 14.05, 14.60, 15.19,
-    15.66, 16.18, 16.55, 17.19, 17.73, 18.32, 18.80, 19.32, 19.74, 20.22, 20.79, 21.32, 21.94,
-    22.44, 22.86, 23.32, 23.97, 24.51, 25.00,
-)  # fmt: skip
-# Difference of each laser's reflectance from its neighbours', on the same road and walls.
-_HDL64E_GAIN = (
-    0.00, -0.04, -0.06, -0.10, -0.01, -0.04, 0.04, -0.02, 0.05, -0.04, 0.02, 0.04, 0.08, 0.03,
-    -0.01, 0.00, 0.01, 0.00, 0.04, -0.05, 0.00, -0.13, 0.00, 0.01, -0.05, -0.02, 0.00, 0.02, 0.02,
-    -0.06, 0.02, 0.03, -0.01, -0.02, 0.00, -0.11, -0.18, 0.00, 0.05, 0.04, -0.03, 0.00, -0.15, 0.00,
-    0.00, 0.00, 0.01, -0.02, -0.06, 0.03, 0.06, -0.21, 0.00, -0.06, -0.07, 0.00, 0.02, 0.04, -0.11,
-    -0.10, -0.11, -0.02, 0.02, 0.00,
-)  # fmt: skip
-
-# Error of each laser's range in metres. Upper block: summed steps between neighbouring rings on
-# upright walls; drives agree (correlation 0.96). Lower block, which rarely sees walls: distances of
-# the rings from a smooth surface through the road 4 to 11 metres away, medians over three drives,
-# which agree within a centimetre.
-_HDL64E_BIAS = (
-    0.006, -0.025, 0.024, -0.031, 0.007, -0.085, 0.051, -0.015, -0.022, 0.012, 0.046, 0.006, 0.042,
-    0.015, -0.012, -0.021, 0.036, -0.005, 0.064, -0.005, 0.003, -0.033, -0.023, -0.027, 0.022,
-    -0.022, 0.009, -0.050, 0.035, -0.006, 0.003, 0.000, 0.015, -0.004, 0.005, -0.012, 0.002, -0.025,
-    0.054, 0.027, -0.007, 0.022, -0.059, -0.059, 0.005, -0.062, -0.050, -0.060, -0.012, 0.018,
-    -0.023, -0.036, -0.002, 0.040, -0.015, 0.004, 0.004, 0.010, 0.023, 0.006, 0.003, 0.049, 0.090,
-    0.098,
-)  # fmt: skip
-
-
-HDL64E = Lasers(
-    elevation=-np.deg2rad(_HDL64E_BELOW),
+_BELOW, _BIAS, _GAIN = np.loadtxt(
+    Path(__file__).with_name("hdl64e.csv"), delimiter=",", unpack=True
+)
+HDL64E = _Lasers(
+    elevation=-np.deg2rad(_BELOW),
     height=np.concatenate([np.linspace(0.209, 0.198, 32), np.linspace(0.126, 0.116, 32)]),
     side=np.tile([0.026, -0.026], 32),  # neighbours are left and right of the axis
     block=np.repeat([0, 1], 32),
     phase=np.modf(0.618 * np.arange(64))[0],  # unknown; neighbours differ
-    bias=np.array(_HDL64E_BIAS, np.float32)[:, None],
-    gain=np.array(_HDL64E_GAIN, np.float32)[:, None],
+    bias=_BIAS.astype(np.float32)[:, None],
+    gain=_GAIN.astype(np.float32)[:, None],
     straight=False,
 )
 
 
 @lru_cache(maxsize=16)
-def lasers_of(sensor: Sensor) -> Lasers:
+def lasers_of(sensor: Sensor) -> _Lasers:
     """The lasers of a sensor: the calibrated lasers of an HDL-64E for any image size, else a laser
     along each row.
     """
-    return HDL64E if sensor.name == "hdl64e" else along_rows(sensor)
+    return HDL64E if sensor.name == "hdl64e" else _along_rows(sensor)
 
 
-def along_rows(sensor: Sensor) -> Lasers:
+def _along_rows(sensor: Sensor) -> _Lasers:
     """Lasers along `sensor.rays("centre")`, all at the origin."""
     elevation = np.deg2rad(np.asarray(sensor.elevations, dtype=np.float64))
     zero = np.zeros_like(elevation)
-    return Lasers(elevation, zero, zero, zero.astype(int), zero, bias=0.0, gain=0.0, straight=True)
+    return _Lasers(elevation, zero, zero, zero.astype(int), zero, bias=0.0, gain=0.0, straight=True)
 
 
 def rows_of(sensor: Sensor, slope: ndarray) -> ndarray:
     """Row of each return by its apparent slope tan e; -1 outside the field of view."""
-    edges = np.tan(np.deg2rad(sensor.row_edges))[::-1].astype(
-        np.float32
-    )  # ascending, for searchsorted
+    falling = np.tan(np.deg2rad(sensor.row_edges)).astype(np.float32)
     h = len(sensor.elevations)
-    row = h - np.searchsorted(edges, slope, side="right")
+    row = h - np.searchsorted(falling[::-1], slope, side="right")
     return np.where(row < h, row, -1)
 
 
@@ -113,7 +85,7 @@ class Rays:
     surface depends on the column only.
     """
 
-    def __init__(self, lasers: Lasers, columns: int, ground: float) -> None:
+    def __init__(self, lasers: _Lasers, columns: int, ground: float) -> None:
         self.lasers = lasers
         self.columns = columns
         self.ground = ground
@@ -147,9 +119,7 @@ def column_windows(azimuth: ndarray, half: ndarray, columns: int) -> tuple[ndarr
     return k, w % columns
 
 
-def row_windows(
-    rays: Rays, spans: tuple[ndarray, ...], bottom: ndarray, top: ndarray
-) -> tuple[ndarray, ...]:
+def row_windows(rays: Rays, spans: Arrays, bottom: ndarray, top: ndarray) -> Arrays:
     """The rays that may intersect solids between their bottom and top.
 
     A span is a solid k, a column w, distances near and far, and more arrays; (N,) each. Returns the
@@ -166,26 +136,12 @@ def row_windows(
     return b * rays.columns + w[n], rays.slope[b], rays.height[b], *(q[n] for q in spans)
 
 
-# Parts of the roof of the ego vehicle, from two KITTI drives: |across|^p + |up|^p < 1 in degrees.
-# Columns: half width, half height, power p, degrees below the horizon, distance in metres from the
-# sensor's axis, whether the part goes straight down to the roof, azimuths. All are nearer than any
-# valid return, so that scans show only their shadows. Lasers beside the axis see them displaced:
-# neighbouring rings are occluded alternately to the left and right.
-_ROOF = (
-    (22, 5.0, 2, 26.5, 1.2, True, (0,)),
-    (6, 2.6, 2, 26.2, 0.8, True, (34, -34)),
-    (5.0, 2.4, 2, 23.2, 0.7, True, (131, -128)),
-    (14, 2.9, 2, 26.5, 0.8, True, (142, -142)),
-    (15, 6.2, 2, 26, 1.2, True, (163, -163)),
-    (18, 6.6, 6, 26, 1.5, True, (180,)),
-    (4.2, 4.0, 4, 17.0, 1.0, False, (161, -158.5)),
-)
-_INSTRUMENT = (11.0, 4.4, 2, 20.0, 0.55, False, (-69,))
-RIGS = ((*_ROOF, _INSTRUMENT), _ROOF)  # with an instrument next to the sensor, and without
+# Parts of the ego vehicle's roof, with an instrument next to the sensor, and without.
+RIGS = ([*TABLES["roof"], TABLES["instrument"]], TABLES["roof"])
 
 
 @lru_cache(maxsize=16)
-def hidden(lasers: Lasers, columns: int, rig: int) -> ndarray:
+def hidden(lasers: _Lasers, columns: int, rig: int) -> ndarray:
     """Rays that the ego vehicle occludes, (B, W), bool, for one of `RIGS`."""
     azimuth = 180 - 360 * (np.arange(columns) + 0.5) / columns
     elevation = np.rad2deg(lasers.elevation)[:, None]

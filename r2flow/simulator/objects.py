@@ -4,18 +4,8 @@ from math import cos, sin, sqrt, tau
 
 from r2flow.simulator.scene import BODY, CABIN, FACADE, SceneBuilder, Site
 from r2flow.simulator.streets import Pose
+from r2flow.simulator.tables import TABLES
 
-# Cars. Columns: share; length and width; height of the lower edge of the panes and of the roof;
-# lean of the windscreen and of the rear window in metres inwards per metre of height; share of the
-# length that is cabin; shift of the cabin's middle to the back, as a share of the length. In
-# metres.
-_CARS = (
-    (0.32, 4.0, 1.70, 0.90, 1.47, 0.80, 0.25, 0.72, 0.08),  # hatchback
-    (0.24, 4.6, 1.78, 0.90, 1.43, 0.95, 0.85, 0.62, 0.03),  # saloon
-    (0.22, 4.7, 1.80, 0.92, 1.47, 0.90, 0.20, 0.72, 0.10),  # estate
-    (0.12, 4.5, 1.86, 1.00, 1.70, 0.60, 0.20, 0.74, 0.10),  # tall
-    (0.10, 4.9, 1.92, 1.05, 1.95, 0.50, 0.05, 0.84, 0.08),  # van
-)
 _NEAR = 40  # metres: clumps of leaves farther away are not resolved by rays
 _SILL, _BONNET = 0.22, 0.70  # metres: heights of the body's lower edge and of the bonnet's front
 
@@ -25,7 +15,8 @@ class ObjectBuilder(SceneBuilder):
 
     def car(self, pose: Pose, moving: bool = False) -> None:
         """A body with plates, a bonnet up to the windscreen, a cabin with panes, four wheels."""
-        form = self.pick(_CARS, [share for share, *_ in _CARS])
+        forms = TABLES["cars"].values()
+        form = self.pick([*forms], [share for share, *_ in forms])
         _, length, width, waist, roof, screen, rear, cabin, shift = form
         length *= self.uniform(0.94, 1.05)
         width *= self.uniform(0.97, 1.03)

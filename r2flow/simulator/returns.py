@@ -2,6 +2,7 @@
 
 import math
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 from numpy import ndarray
@@ -18,16 +19,6 @@ _NOISE = 0.006  # metres, scale of the range noise at range 0
 _NOISE_FAR = 0.0002  # added per metre of range
 _RANGE_STEP = 0.002  # metres: resolution of reported ranges
 _LEVELS = 100  # reflectance is reported in steps of 1 / _LEVELS
-# Width of each level from 0.02 to 0.69, in steps: the sensor has internal steps, several of which
-# may share a hundredth while other hundredths have none. Frequencies of the levels in three drives
-# over the frequencies of their neighbours.
-_WIDTHS = (
-    0.16, 0.58, 1.98, 1.58, 0.30, 0.71, 0.80, 1.14, 0.98, 1.25, 1.00, 0.48, 0.76, 0.59, 1.29, 0.93,
-    1.66, 1.02, 1.12, 0.91, 0.58, 0.99, 0.64, 1.03, 0.73, 1.15, 0.93, 1.55, 1.38, 0.89, 1.24, 0.76,
-    1.14, 0.80, 1.21, 0.76, 1.17, 1.06, 0.71, 1.08, 0.67, 1.10, 0.63, 1.15, 1.00, 0.75, 1.16, 0.71,
-    1.12, 0.72, 1.30, 0.84, 1.11, 1.20, 0.67, 1.05, 0.83, 1.12, 0.68, 1.05, 1.10, 0.69, 1.06, 0.65,
-    1.09, 0.75, 1.10, 0.76,
-)  # fmt: skip
 _CALIBRATED = 16.0  # metres up to which the sensor compensates for distance
 _FADE = 0.0068  # loss of reflectance per metre beyond
 _DARK = 0.13  # reflectance below a random threshold of at most this is reported as 0
@@ -100,13 +91,13 @@ def report(
 @cache
 def _levels() -> ndarray:
     """The reported reflectance for readings of 0, 1/2000, 2/2000, ... 1, (2001,), float32."""
-    first, last = 2, 1 + len(_WIDTHS)
-    edges = (
-        first - 0.5 + np.cumsum(_WIDTHS) * (len(_WIDTHS) / sum(_WIDTHS))
-    ) / _LEVELS  # upper edges
+    widths = np.loadtxt(Path(__file__).with_name("reflectance_levels.csv"))
+    first = 2
+    last = 1 + len(widths)
+    upper = (first - 0.5 + np.cumsum(widths) * (len(widths) / widths.sum())) / _LEVELS
     reading = np.arange(2001) / 2000
     level = np.where(
-        reading < (first - 0.5) / _LEVELS, 0, first + np.searchsorted(edges, reading, side="right")
+        reading < (first - 0.5) / _LEVELS, 0, first + np.searchsorted(upper, reading, side="right")
     )
     level = np.where(reading > (last + 0.5) / _LEVELS, np.rint(reading * _LEVELS), level)
     return (np.minimum(level, _LEVELS - 1) / _LEVELS).astype(np.float32)

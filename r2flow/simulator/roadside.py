@@ -14,7 +14,7 @@ _END = 82.0  # metres: maximum distance of objects from the sensor
 _CLEAR = 3.2  # metres around the sensor that stay empty
 
 
-class Strip(NamedTuple):
+class _Strip(NamedTuple):
     """A strip along a side of a street, `length` metres from u on."""
 
     street: Street
@@ -36,7 +36,7 @@ class Strip(NamedTuple):
     def ends(self, out: float) -> list[Pose]:
         return [self.place(self.u, out), self.place(self.stop, out)]
 
-    def anywhere(self, draws: ScalarDraws, edge: float, low: float, high: float) -> Pose:
+    def _anywhere(self, draws: ScalarDraws, edge: float, low: float, high: float) -> Pose:
         """A random place, low to high metres beyond the edge."""
         return self.place(self.u + draws.uniform(0, self.length), edge + draws.uniform(low, high))
 
@@ -51,7 +51,7 @@ class StreetBuilder(ObjectBuilder):
         for street in streets:
             start = max(-_END, street.start)
             for side in (1, -1):
-                strip = Strip(street, side, start, min(_END, street.stop) - start)
+                strip = _Strip(street, side, start, min(_END, street.stop) - start)
                 self._line(strip)
                 self._park(strip)
                 self._furnish(strip)
@@ -80,7 +80,7 @@ class StreetBuilder(ObjectBuilder):
         others = (other for other in self.ground.streets if other != street)
         return 2.6 < pose.away < _END and all(other.away(pose.x, pose.y) > room for other in others)
 
-    def _line(self, side: Strip) -> None:
+    def _line(self, side: _Strip) -> None:
         """Place plots along a side of a street."""
         setback = self.uniform(*self.kind.setback)
         edge = side.street.half_width + side.street.pavement
@@ -104,7 +104,7 @@ class StreetBuilder(ObjectBuilder):
                 self._green(gap, edge + back + 2)
             u = gap.stop
 
-    def _house(self, plot: Strip, edge: float) -> bool:
+    def _house(self, plot: _Strip, edge: float) -> bool:
         """A house, if there is room, usually with an object behind it that limits the view."""
         width = self.uniform(8, 12)
         middle = plot.middle(edge + width / 2)
@@ -116,7 +116,7 @@ class StreetBuilder(ObjectBuilder):
             self._beyond(plot, edge + width)
         return built
 
-    def _garden(self, plot: Strip, edge: float, back: float) -> None:
+    def _garden(self, plot: _Strip, edge: float, back: float) -> None:
         """Hedge or fence and plants between pavement and house."""
         if back > 1.2 and self._free(0.1, *plot.ends(edge + 0.6)):
             pose = plot.middle(edge + 0.6)
@@ -136,7 +136,7 @@ class StreetBuilder(ObjectBuilder):
         else:
             self.bush(pose, self.uniform(0.5, 1.3))
 
-    def _green(self, plot: Strip, edge: float) -> None:
+    def _green(self, plot: _Strip, edge: float) -> None:
         """A plot without a house: trees, bushes, thickets."""
         if self.chance(0.35):
             pose = plot.middle(edge + self.uniform(0.5, 3))
@@ -144,13 +144,13 @@ class StreetBuilder(ObjectBuilder):
             if self._free(0.1, pose.shifted(-half), pose.shifted(half)):
                 self.hedge(pose, plot.length, self.uniform(1.0, 2.6))
         for _ in range(self.poisson(plot.length / 2.2)):
-            self._plant(plot.anywhere(self, edge, 0.3, 14))
+            self._plant(plot._anywhere(self, edge, 0.3, 14))
         for _ in range(self.poisson(plot.length / 6)):
-            pose = plot.anywhere(self, edge, 7, 22)
+            pose = plot._anywhere(self, edge, 7, 22)
             if self._free(3.5, pose):
                 self.thicket(pose)
 
-    def _car_park(self, plot: Strip, edge: float) -> None:
+    def _car_park(self, plot: _Strip, edge: float) -> None:
         """A car park on a green plot: two rows of cars at right angles to the street."""
         for row in (3.5, 11.0):
             for slot in range(-3, 4):
@@ -159,7 +159,7 @@ class StreetBuilder(ObjectBuilder):
                     self.car(pose.turned(pi / 2 * self.side() + self.normal(0, 0.03)))
         self._beyond(plot, edge + 10)
 
-    def _beyond(self, plot: Strip, edge: float) -> None:
+    def _beyond(self, plot: _Strip, edge: float) -> None:
         """The second row: a house or tall trees that limit the view."""
         shift = self.uniform(-8, 8)
         pose = plot.middle(edge + self.uniform(12, 28), shift)
@@ -190,7 +190,7 @@ class StreetBuilder(ObjectBuilder):
             elif self._free(6, pose):
                 self.woods(pose._replace(yaw=0.0))
 
-    def _park(self, side: Strip) -> None:
+    def _park(self, side: _Strip) -> None:
         """Parked cars along the kerb, partly on it, with gaps; or side by side, facing the kerb."""
         if self.chance(0.2) or self.kind.parked == 0:
             return
@@ -216,7 +216,7 @@ class StreetBuilder(ObjectBuilder):
             turn = pi / 2 * self.side()
             self.car(pose.turned((turn if nose_in else 0) + self.normal(0, 0.03)))
 
-    def _furnish(self, side: Strip) -> None:
+    def _furnish(self, side: _Strip) -> None:
         """Lamp posts, signs, rows of trees, bollards, bins and bicycles along the kerb."""
         street = side.street
         edge = street.half_width + min(0.5, street.pavement / 2 + 0.2)
@@ -240,7 +240,7 @@ class StreetBuilder(ObjectBuilder):
         if street.pavement > 0:
             self._clutter(side, edge)
 
-    def _clutter(self, side: Strip, edge: float) -> None:
+    def _clutter(self, side: _Strip, edge: float) -> None:
         if self.chance(0.25):
             start = self.uniform(-30, 20)
             for step in range(self.whole(3, 8)):

@@ -61,7 +61,7 @@ class Site(NamedTuple):
         **options: Any,
     ) -> None:
         """Add a box; with leans of its front, back and sides, a frustum."""
-        shape: Any = Frusta if leans else Boxes
+        shape = Frusta if leans else Boxes
         size = length, width, self.ground + bottom, self.ground + top
         solid = shape(*self.pose.shifted(x, y), *size, *leans)
         self.builder.add(solid, self.ground, *surface, **options)

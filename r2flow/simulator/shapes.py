@@ -13,7 +13,7 @@ from numpy import ndarray
 from numpy.random import Generator
 
 from r2flow.simulator.draws import cosine, exponential_quantiles, hypotenuse, rotate, scramble, sine
-from r2flow.simulator.lasers import Rays, column_windows, row_windows
+from r2flow.simulator.lasers import Arrays, Rays, column_windows, row_windows
 
 # A field of all solids of a table, (P,) float32; a number for a single solid.
 Column = Any
@@ -49,7 +49,7 @@ class Frusta(
 ):
     """Boxes whose sides lean inwards by metres (>= 0) per metre of height; every field a column."""
 
-    def leans(self) -> ndarray:
+    def _leans(self) -> ndarray:
         """Lean of the sides ahead, behind, left and right, (4, P)."""
         return np.stack([self.front, self.back, self.sides, self.sides])
 
@@ -63,7 +63,7 @@ class Frusta(
         solids = row_windows(rays, _box_spans(self, rays), self.bottom, self.top)
         pixel, slope, height, k, _, near, far, u, v, du, dv = solids
         rise = height - self.bottom[k]
-        lean = self.leans()[:, k]
+        lean = self._leans()[:, k]
         direction = _outwards(du, dv) + lean * slope
         room = _reach(self)[:, k] - _outwards(u, v) - lean * rise
         below = self.top[k] - self.bottom[k] - rise
@@ -72,7 +72,7 @@ class Frusta(
 
     def normal(self, k: ndarray, x: ndarray, y: ndarray, z: ndarray) -> Normal:
         u, v, c, s = _into(self, k, x, y)
-        lean = self.leans()[:, k]
+        lean = self._leans()[:, k]
         outside = _outwards(u, v) + lean * (z - self.bottom[k]) - _reach(self)[:, k]
         face = np.stack([*outside, z - self.top[k], self.bottom[k] - z]).argmax(0)
         up = np.ones(len(k), np.float32)
@@ -179,14 +179,14 @@ def _depths(k: ndarray, b: ndarray, w: ndarray, rng: Generator) -> ndarray:
     return quantiles[(scramble(k, cell, b, int(rng.integers(1 << 31))) >> 8) % len(quantiles)]
 
 
-def _into(solids: Frusta, k: ndarray, x: Column, y: Column) -> tuple[ndarray, ...]:
+def _into(solids: Frusta, k: ndarray, x: Column, y: Column) -> Arrays:
     """Points in the frames of the solids, and cos and sin of their yaw: (u, v, c, s), (N,) each."""
     c = cosine(solids.yaw)[k]
     s = sine(solids.yaw)[k]
     return *rotate(x - solids.x[k], y - solids.y[k], c, s), c, s
 
 
-def _box_spans(solids: Frusta, rays: Rays) -> tuple[ndarray, ...]:
+def _box_spans(solids: Frusta, rays: Rays) -> Arrays:
     """Columns w in footprints of solids k: k, w, near < far in metres; origin and direction in the
     solid's frame.
     """
@@ -209,7 +209,7 @@ def _crossed(solids: Shape, radius: ndarray, rays: Rays) -> tuple[ndarray, ndarr
     return column_windows(azimuth, angle + _EDGE, rays.columns)
 
 
-def _chords(solids: Cylinders | Blobs, rays: Rays) -> tuple[ndarray, ...]:
+def _chords(solids: Cylinders | Blobs, rays: Rays) -> Arrays:
     """Chords ahead in circular footprints: k, w, near, far, midpoint and half length."""
     k, w = _crossed(solids, solids.radius, rays)
     middle, across = rotate(solids.x[k], solids.y[k], rays.cos[w], rays.sin[w])
@@ -220,7 +220,7 @@ def _chords(solids: Cylinders | Blobs, rays: Rays) -> tuple[ndarray, ...]:
     return tuple(q[met] for q in (k, w, np.maximum(middle - half, _NEAR), far, middle, half))
 
 
-def _upright(solids: Boxes | Cylinders, rays: Rays, spans: tuple[ndarray, ...]) -> Fragments:
+def _upright(solids: Boxes | Cylinders, rays: Rays, spans: Arrays) -> Fragments:
     """First intersection of rays with upright solids in spans, including both lids."""
     rows = row_windows(rays, spans, solids.bottom, solids.top)
     pixel, slope, height, k, _, near, far, *_ = rows

@@ -28,12 +28,13 @@ from r2flow.model.sampling import draw
 from r2flow.noise import seed_torch
 from r2flow.plugins import loaded_plugins
 from r2flow.processes import average_gradients
-from r2flow.registry import Natural, NonNegative, Portion, Seed
+from r2flow.registry import Natural, NonNegative, Options, Portion, Seed
 from r2flow.samplers import build_sampler
 from r2flow.stages.muon import Muon
 
+_BEYOND = 1.1  # largest value of a scan in model space, with some tolerance
+
 Batch = dict[str, Tensor]
-Options = Mapping[str, Any]
 
 
 class Stage(L.LightningModule):
@@ -189,7 +190,12 @@ class Stage(L.LightningModule):
         if self.trainer.train_dataloader is None:  # as `estimated_stepping_batches` does
             self.trainer.fit_loop.setup_data()
         loader: Any = self.trainer.train_dataloader
-        return loader.batch_size * self.trainer.world_size * self.trainer.accumulate_grad_batches
+        sampler = getattr(loader, "batch_sampler", None)
+        # Loaders of other kinds do not say it.
+        batch: int = (
+            getattr(loader, "batch_size", None) or getattr(sampler, "batch_size", None) or 1
+        )
+        return batch * self.trainer.world_size * self.trainer.accumulate_grad_batches
 
     @property
     def total_steps(self) -> float:
@@ -211,6 +217,12 @@ class Stage(L.LightningModule):
             batch = {"x_1": batch}
         if "x_0" not in batch:
             x_1 = batch["x_1"]
+            if x_1.shape[1:] != self.space.shape or not x_1.abs().amax() <= _BEYOND:
+                raise InputError(
+                    f"x_1 must be scans (B, C, H, W) of {self.space.shape} in [-1, 1], found "
+                    f"{tuple(x_1.shape)} up to {x_1.abs().amax():g}: encode metres by "
+                    "module.encoding.encode."
+                )
             batch["x_0"] = torch.randn(len(x_1), *self.generator.noise_shape, device=x_1.device)
             batch["u"] = torch.rand(len(x_1), device=x_1.device)
             batch["k"] = torch.randint(2**31, (len(x_1),), device=x_1.device)
@@ -275,7 +287,7 @@ class Stage(L.LightningModule):
             self.hparams["seed"], "dropout", position * self.trainer.world_size + self.global_rank
         )
 
-    def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
+    def predict_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> Tensor:
         """Scans of the numbers `k`: range in metres and reflectance, (B, 2 or 1, H, W), 0 without a
         return.
         """
@@ -285,14 +297,15 @@ class Stage(L.LightningModule):
     def on_test_start(self) -> None:
         self.panel = METRICS["panel"](sensor=self.sensor)
 
-    def test_step(self, batch: Batch, batch_idx: int) -> None:
+    def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
         batch = self.whole_batch(batch)
         self.panel.update(self.space.decode(batch["x_1"]).cpu(), real=True)
         self.panel.update(self.predict_step(batch, batch_idx).cpu(), real=False)
 
     def on_test_epoch_end(self) -> None:
         """Log the panel's distances of held-out to generated scans, `test/panel` their mean."""
-        self.log_dict({f"test/{name}": value for name, value in self.panel.compute().items()})
+        found = {f"test/{name}": value for name, value in self.panel.compute().items()}
+        self.log_dict(found, sync_dist=True)
 
     def configure_optimizers(self) -> Any:
         return self.optimizers_for(self.parameters())
@@ -373,10 +386,12 @@ class Stage(L.LightningModule):
             **self.generator.drawing(),
         }
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        if "state_dict" in checkpoint:  # a sharded strategy reads its own
-            with naming("the checkpoint to resume from"):  # a plug-in may have changed
-                check_weights(self, checkpoint["state_dict"])
+    def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
+        """Load weights; with `strict`, those that do not fit are refused in one line."""
+        if strict:
+            with naming("the checkpoint"):  # a plug-in may have changed
+                check_weights(self, state_dict)
+        return super().load_state_dict(state_dict, strict, assign)
 
 
 class SingleLoss(Stage):
@@ -406,7 +421,7 @@ class SingleLoss(Stage):
         )
         return loss
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+    def validation_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
         # A low-discrepancy sequence over [0, 1) instead of random times reduces the variance over
         # few scans.
         batch = self.whole_batch(batch)

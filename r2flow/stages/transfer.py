@@ -133,7 +133,7 @@ class Transfer(SingleLoss):
             further=partial(self.tasks, self.generator.space), smallest=smallest
         )
 
-    def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
+    def predict_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> Tensor:
         """Scans completed from every fourth row: range in metres and reflectance, (B, 2 or 1, H,
         W).
         """

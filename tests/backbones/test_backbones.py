@@ -225,19 +225,25 @@ def test_every_configuration_builds_for_every_sensor(config):
 
 
 @pytest.mark.parametrize(
-    ("names", "count"),
+    ("names", "count", "size"),
     [
         (
             ("hdit_18m", "adm_unet_18m", "efficient_unet_18m"),
             lambda model: sum(p.numel() for p in model.parameters()),
+            (64, 1024),
         ),
-        (("hdit_18m", "adm_unet_15g", "efficient_unet_15g"), count_macs),
+        (("hdit_18m", "adm_unet_15g", "efficient_unet_15g"), count_macs, (64, 1024)),
+        (
+            ("hdit_tiny", "adm_unet_tiny", "efficient_unet_tiny", "vit_tiny"),
+            count_macs,
+            (32, 256),
+        ),
     ],
 )
-def test_backbones_of_an_ablation_are_of_one_size_or_one_cost(names, count):
+def test_backbones_of_an_ablation_are_of_one_size_or_one_cost(names, count, size):
     with torch.device("meta"):
         counts = [
-            count(build_backbone(configurations()[name], build_sensor("hdl64e").rays(), 2))
+            count(build_backbone(configurations()[name], build_sensor("hdl64e", *size).rays(), 2))
             for name in names
         ]
     assert max(counts) <= 1.1 * min(counts)

@@ -135,8 +135,9 @@ class TestWhatR2FlowWrote:
         wrong_scale = replace(reading, reflectance_scale=255.0)
         for name in (tmp_path, tmp_path / "000005.ply"):
             np.testing.assert_allclose(open_scans(name, wrong_scale).source[0], image, atol=1e-5)
-        scan = r2flow.read(tmp_path / "000005.ply")
+        scan, found = r2flow.read(tmp_path / "000005.ply", return_sensor=True)
         assert (scan.dtype, scan.shape) == (torch.float32, (2, 16, 64))
+        assert found.same_image(sensor)
         np.testing.assert_allclose(scan.numpy(), image, atol=1e-5)
         assert not caplog.text
 

@@ -1,4 +1,4 @@
-"""Samples as the published R2Flow code writes them."""
+"""Samples as the published codes of R2Flow and R2DM write them."""
 
 import zipfile
 from collections import OrderedDict
@@ -22,10 +22,11 @@ def sample(channels: int = 1, rows: int = 8, columns: int = 64) -> dict[str, tor
     return {"depth": xyz.norm(dim=0, keepdim=True), "xyz": xyz, "reflectance": reflectance}
 
 
-def test_a_sample_is_an_image_and_points(tmp_path):
+@pytest.mark.parametrize("stacked", [False, True], ids=["r2flow", "r2dm"])
+def test_a_sample_is_an_image_and_points(tmp_path, stacked: bool):
     stored = sample()
     path = tmp_path / "sample_0000000000.pth"
-    torch.save(stored, path)
+    torch.save(torch.cat(list(stored.values())) if stacked else stored, path)
     image = torch.cat([stored["depth"], stored["reflectance"]])
     np.testing.assert_array_equal(read_range_image(path), image)
     np.testing.assert_array_equal(r2flow.read(path), image * (image[:1] > 0))

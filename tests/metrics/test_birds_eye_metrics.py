@@ -10,13 +10,13 @@ import torch
 from r2flow.metrics import jsd_mmd, lidm
 from r2flow.metrics.jsd_mmd import JSD, MMD, js_distance
 from r2flow.metrics.lidm import JSDLiDM, MMDLiDM
-from r2flow.metrics.scans import birds_eye_histogram
+from r2flow.metrics.scans import _birds_eye_histogram
 from tests.metrics.conftest import given, measured, scans_of
 
 
 def test_reference_figures(shared):
     case = torch.load(shared / "oracle" / "bev_metrics.pt", weights_only=True)
-    seen = np.stack([birds_eye_histogram(points.numpy()) for points in case["point_clouds"]])
+    seen = np.stack([_birds_eye_histogram(points.numpy()) for points in case["point_clouds"]])
     np.testing.assert_array_equal(seen, case["hists"])
     real, generated = seen[:12].astype(float), seen[12:].astype(float)
     # made of float32 histograms

@@ -7,8 +7,8 @@ from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.extractors import EXTRACTORS, pointnet
 from r2flow.metrics.extractors.pointnet import PointNet
-from r2flow.metrics.extractors.rangenet import RangeNet21, RangeNet53, translate
-from r2flow.metrics.extractors.voxels import SPVCNN, MinkowskiNet, mean_by_distance, voxelise
+from r2flow.metrics.extractors.rangenet import RangeNet21, RangeNet53, _translate
+from r2flow.metrics.extractors.voxels import SPVCNN, MinkowskiNet, _mean_by_distance, _voxelise
 from r2flow.metrics.scans import Scans
 from tests.metrics.conftest import untrained
 from tests.reference import load_case
@@ -79,7 +79,7 @@ def test_rangenet21_is_the_reference(shared):
     def close(found, expected):
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
 
-    x = network.normalise(case["img"])
+    x = network._normalise(case["img"])
     close(x, case["pre"])
     maps = network(x)
     close(maps[:1], case["penultimate_b0"])
@@ -110,7 +110,7 @@ def test_names_of_the_original_release_are_ours(cls, blocks):
         == blocks
     )
     ours = set(network.state_dict())
-    assert {translate(name) for name in ours} == ours
+    assert {_translate(name) for name in ours} == ours
     for theirs, name in {
         "conv1.weight": "stem.0.weight",
         "bn1.running_mean": "stem.1.running_mean",
@@ -122,7 +122,7 @@ def test_names_of_the_original_release_are_ours(cls, blocks):
         "decoder.dec3.residual.conv1.weight": "dec3.residual_blocks.0.residual.0.0.weight",
         "1.bias": "head.1.bias",
     }.items():
-        assert translate(theirs) == name
+        assert _translate(theirs) == name
         assert name in ours
 
 
@@ -138,9 +138,9 @@ def test_weights_bring_their_classes(network):
 def test_ranges_are_normalised_where_there_is_a_return(network):
     image = torch.tensor([12.12, 10.88 + 11.47, 0.23, 0.0]).view(1, 4, 1, 1)
     torch.testing.assert_close(
-        network.normalise(image).flatten(), torch.tensor([0, 1, 0, 1.04 / 0.86])
+        network._normalise(image).flatten(), torch.tensor([0, 1, 0, 1.04 / 0.86])
     )
-    assert not network.normalise(image * 0).any()
+    assert not network._normalise(image * 0).any()
 
 
 @pytest.mark.parametrize("size", [(16, 40), (12, 32)])
@@ -151,22 +151,22 @@ def test_sizes_that_the_network_cannot_take_name_the_option(network, size):
 
 def test_voxels_and_their_pooling_are_the_reference_s(shared):
     case = torch.load(shared / "oracle" / "voxel_prepost.pt", weights_only=True)
-    coords, features = voxelise(case["points"])
+    coords, features = _voxelise(case["points"])
     torch.testing.assert_close(coords, case["voxel_coords"], rtol=0, atol=0)
     torch.testing.assert_close(features, case["voxel_feats"], rtol=1e-4, atol=1e-4)
     features = case["post_features_in"]
     torch.testing.assert_close(
-        mean_by_distance(features, coords)[None], case["post_depth"], rtol=1e-4, atol=1e-4
+        _mean_by_distance(features, coords)[None], case["post_depth"], rtol=1e-4, atol=1e-4
     )
 
 
 def test_voxels_by_hand():
     # In voxels of 5 cm: (20, 0, 0), a point of the same voxel, no point at all, and (-20, 10, 2).
     points = torch.tensor([[1.0, 0.0, 0.0], [1.02, 0.01, 0.0], [0.0, 0.0, 0.0], [-1.0, 0.5, 0.1]])
-    coords, features = voxelise(points)
+    coords, features = _voxelise(points)
     assert coords.tolist() == [[40, 0, 0], [0, 10, 2]]
     torch.testing.assert_close(features, torch.tensor([[1.0, 0, 0, -1], [-1, 0.5, 0.1, -1]]))
-    assert voxelise(points[2:3])[0].shape == (0, 3)
+    assert _voxelise(points[2:3])[0].shape == (0, 3)
 
 
 def test_sectors_by_hand():
@@ -174,8 +174,8 @@ def test_sectors_by_hand():
     coords = torch.tensor([[20, 3, 0], [-20, -3, 0], [-30, 200, 0], [30, -200, 0]]) + 500
     features = torch.tensor([[1.0], [3.0], [10.0], [20.0]])
     # Edges 0, 7.25, 10.5, ...: 4 + 52 i / 16 m, the first put to 0.
-    assert mean_by_distance(features, coords).tolist() == [2, 15] + [0] * 14
-    assert mean_by_distance(features, coords * 1000).tolist() == [0] * 16
+    assert _mean_by_distance(features, coords).tolist() == [2, 15] + [0] * 14
+    assert _mean_by_distance(features, coords * 1000).tolist() == [0] * 16
 
 
 @pytest.mark.parametrize("cls", [MinkowskiNet, SPVCNN])

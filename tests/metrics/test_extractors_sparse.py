@@ -79,7 +79,7 @@ class Dense:
         x = self.steps(change.net, x, 4 - number)
         return self.residuals(list(blocks), torch.cat([x, kept], 1), 4 - number)
 
-    def to_points(self, x: torch.Tensor, level: int) -> torch.Tensor:
+    def _to_points(self, x: torch.Tensor, level: int) -> torch.Tensor:
         """The eight voxels from a point's own on, by the share of the way to each, as far as they
         exist.
         """
@@ -91,7 +91,7 @@ class Dense:
         ].T
         return there[:, :-1] / there[:, -1:]
 
-    def to_voxels(self, points: torch.Tensor, level: int) -> torch.Tensor:
+    def _to_voxels(self, points: torch.Tensor, level: int) -> torch.Tensor:
         held = to_dense(points, self.coords, self.masks[0].shape)
         size = 2**level
         return F.avg_pool3d(held, size) / F.avg_pool3d(self.masks[0], size).clamp(min=1e-9)
@@ -123,11 +123,11 @@ def test_spvcnn_is_its_dense_self():
     network = randomised(SPVCNN((3, 3, 4, 5, 6, 6, 5, 4, 3)))
     dense = Dense(network, coords, mask)
     maps = dense.down(to_dense(x, coords, mask.shape))
-    points = dense.to_points(maps[4], 4) + network.point_transforms[0](at(maps[0], coords))
-    y = dense.up(1, dense.to_voxels(points, 4), maps[3])
+    points = dense._to_points(maps[4], 4) + network.point_transforms[0](at(maps[0], coords))
+    y = dense.up(1, dense._to_voxels(points, 4), maps[3])
     y = dense.up(2, y, maps[2])
-    points = dense.to_points(y, 2) + network.point_transforms[1](points)
-    y = dense.up(3, dense.to_voxels(points, 2), maps[1])
+    points = dense._to_points(y, 2) + network.point_transforms[1](points)
+    y = dense.up(3, dense._to_voxels(points, 2), maps[1])
     y = dense.up(4, y, maps[0])
     expected = at(y, coords) + network.point_transforms[2](points)
     # 1e-8 is added to the sum of the eight weights, as torchsparse does, and weights are float32

@@ -10,7 +10,7 @@ import torch
 
 from r2flow.errors import InputError
 from r2flow.metrics.extractors import EXTRACTORS
-from r2flow.metrics.extractors.base import SOURCES, add, kept, read_published, weights_hash
+from r2flow.metrics.extractors.base import SOURCES, _read_published, add, kept, weights_hash
 from r2flow.metrics.extractors.pointnet import PointNet
 from tests.metrics.conftest import untrained
 
@@ -146,7 +146,7 @@ def test_weights_of_another_network_are_refused_in_a_line(tmp_path, pointnet, fo
 
 @pytest.mark.parametrize("kind", ["folder", "tar.gz"])
 def test_the_release_of_several_files_is_read_as_one(tmp_path, kind):
-    tensors = read_published(pack(tmp_path, kind))
+    tensors = _read_published(pack(tmp_path, kind))
     expected = {name: value for part in PARTS.values() for name, value in part.items()}
     assert {name: value.tolist() for name, value in tensors.items()} == {
         n: v.tolist() for n, v in expected.items()
@@ -156,17 +156,17 @@ def test_the_release_of_several_files_is_read_as_one(tmp_path, kind):
 def test_archives_of_nothing_of_several_and_of_halves_are_said(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="holds none of backbone"):
-        read_published(tmp_path / "empty")
+        _read_published(tmp_path / "empty")
     (tmp_path / "model.ckpt").write_bytes(saved(PARTS["backbone"]))
     with tarfile.open(tmp_path / "two.tar.gz", "w:gz") as tar:
         for folder in ("kitti", "nuscenes"):
             tar.add(tmp_path / "model.ckpt", f"{folder}/spvcnn/model.ckpt")
     with pytest.raises(InputError, match=r"several networks \('model.ckpt' twice\)"):
-        read_published(tmp_path / "two.tar.gz")
+        _read_published(tmp_path / "two.tar.gz")
     path = pack(tmp_path, "tar.gz")
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(InputError, match="damaged"):
-        read_published(path)
+        _read_published(path)
 
 
 def test_pipes_and_devices_are_refused_at_once(tmp_path):

@@ -9,12 +9,20 @@ import torch
 from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading
 from r2flow.data.sets import ScanSet
-from r2flow.evaluation.sets import BASELINES, Baseline
+from r2flow.evaluation.sets import BASELINES, _Baseline
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics import METRICS
 from r2flow.metrics import panel as lines
 from r2flow.metrics.jsd_mmd import js_distance
-from r2flow.metrics.panel import PANEL, RUNS, Scan, distances, panel, rate_distance, steps_by_sector
+from r2flow.metrics.panel import (
+    PANEL,
+    RUNS,
+    Scan,
+    _rate_distance,
+    _steps_by_sector,
+    distances,
+    panel,
+)
 from r2flow.metrics.scans import Scans
 from tests.metrics.conftest import measured
 
@@ -43,7 +51,7 @@ def scan_of(image: np.ndarray) -> Scan:
 
 
 def baseline(name: str, training: np.ndarray, num: int, sensor=SENSOR) -> np.ndarray:
-    source = Baseline(name, training, sensor, range(num))
+    source = _Baseline(name, training, sensor, range(num))
     return np.stack([source[i] for i in range(num)])
 
 
@@ -67,7 +75,7 @@ def test_the_histograms_are_numpy_s_and_every_member_has_its_size():
         assert counts.size == member.size, name
         np.testing.assert_array_equal(counts, expected.get(name, counts).ravel(), err_msg=name)
     # of 1024 rows
-    assert (lines.changes_row(scan_of(np.indices((1030, 64)).sum(0)[None] % 2))[:2] == 64).all()
+    assert (lines._changes_row(scan_of(np.indices((1030, 64)).sum(0)[None] % 2))[:2] == 64).all()
 
 
 def test_the_metric_has_the_distances_of_the_sets_and_their_mean():
@@ -142,7 +150,7 @@ def test_mirrored_scans_of_a_car_that_keeps_to_the_right_are_seen():
     )[:, None]
 
     def steps(scans: np.ndarray) -> np.ndarray:
-        return sum(steps_by_sector(scan_of(image)) for image in scans)
+        return sum(_steps_by_sector(scan_of(image)) for image in scans)
 
     one, other = steps(images[:30]), steps(images[30:])
     mirrored = steps(np.roll(images[30:, ..., ::-1], 1, axis=-1))  # about the first column
@@ -170,7 +178,9 @@ def test_a_set_without_surfaces_is_not_near_in_the_drop_rate():
     ):
         other = np.array([*rates, [200, 200]])
         assert (
-            rate_distance(counts, other) == rate_distance(other, counts) == pytest.approx(expected)
+            _rate_distance(counts, other)
+            == _rate_distance(other, counts)
+            == pytest.approx(expected)
         )
     # of two rows
     lines = distances(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from r2flow.lidar.sensors import SENSORS
-from r2flow.metrics.panel import PANEL, Scan, drop_incidence, drop_range, drop_rate
+from r2flow.metrics.panel import PANEL, Scan, _drop_incidence, _drop_range, _drop_rate
 from r2flow.metrics.surfaces import bridged, normals
 
 SENSOR = SENSORS["hdl64e"].resized(32, 512)
@@ -86,13 +86,13 @@ def test_the_drop_rate_is_the_share_that_a_mask_takes():
     near, far = 5.0, 50.0
     r = np.where(np.arange(512) < 256, near, far) * np.ones((4, *SENSOR.shape))
     lost = rng.random(r.shape) < np.where(r == near, 0.05, 0.25)
-    rate = share(drop_range, np.where(lost, 0, r)[:, None].astype(np.float32))
+    rate = share(_drop_range, np.where(lost, 0, r)[:, None].astype(np.float32))
     bin_of = np.searchsorted(np.geomspace(3, 80, 13), [near, far]) - 1
     # deviations of 32,768 draws: 0.0012 and 0.0024
     assert rate[bin_of] == pytest.approx([0.05, 0.25], abs=0.01)
     # between them there are but gaps across the edge, at 27.5 m: nothing that is not lost
     assert rate.sum() == pytest.approx(0.05 + 0.25 + 1, abs=0.01)
-    counts = drop_rate(
+    counts = _drop_rate(
         np.array([1.0, 2, 3, np.nan]), np.array([True, False, True, True]), np.array([0.0, 2.5, 5])
     )
     np.testing.assert_array_equal(counts, [[1, 1], [2, 1], [4, 4]])
@@ -105,7 +105,7 @@ def test_losses_on_flat_ground_fall_into_the_bins_of_its_elevations():
         np.float32
     )
     # bins of 9 degrees, from 90 down: 63 to 90 is what -27 to 0 looks like
-    rate = share(drop_incidence, images)
+    rate = share(_drop_incidence, images)
     assert (rate[3:] == 0).all()
     assert rate[1] == pytest.approx(0.02, abs=0.01)
     upward = sum(PANEL["surface normals"].counts(scan) for scan in scans_of(images))

@@ -14,9 +14,9 @@ from PIL import Image
 
 from r2flow.errors import InputError
 from r2flow.generators import build_generator
-from r2flow.reports.compare import cell, compare_page, configuration, group_rows, group_runs
+from r2flow.reports.compare import _group_rows, cell, compare_page, configuration, group_runs
 from r2flow.reports.pages import write_page
-from r2flow.reports.runs import find_runs, read_runs
+from r2flow.reports.runs import _find_runs, read_runs
 from r2flow.reports.tables import short_names
 from r2flow.reports.training import curves_figure, read_curves, smooth
 from tests.conftest import CONFIG as FLOW
@@ -109,13 +109,13 @@ def test_several_seeds_are_one_line_with_mean_and_spread(tmp_path):
     make_run(tmp_path / "other-seed=1", {"stage.learning_rate": 2e-3, "seed": 1}, checkpoint=40)
     groups = group_runs(read_runs([tmp_path]))
     assert {label: len(runs) for label, runs in groups.items()} == {"net": 3, "other": 2}
-    rows = group_rows(groups)
+    rows = _group_rows(groups)
     assert rows[0]["val_last_spread"] == pytest.approx(math.sqrt((0.09 + 0.01 + 0.16) / 2))
     assert (rows[0]["n"], cell(rows[0], "val_last")) == (3, "0.5 ± 0.361")
     assert cell(rows[1], "val_last") == cell(rows[1], "val_best") == "0.1"
     for seed, value in ((3, math.inf), (4, math.nan)):
         make_run(tmp_path / f"net-seed={seed}", {"seed": seed}, val=[value], checkpoint=40)
-        assert cell(group_rows(group_runs(read_runs([tmp_path])))[0], "val_last") == str(value)
+        assert cell(_group_rows(group_runs(read_runs([tmp_path])))[0], "val_last") == str(value)
 
 
 def test_two_sweeps_are_told_apart_by_what_was_swept(tmp_path):
@@ -165,11 +165,11 @@ def test_a_sweep_s_files_and_folders_without_a_run_are_passed_over(tmp_path):
     (tmp_path / "latest").symlink_to(make_run(tmp_path / "a"))
     (tmp_path / "multirun.yaml").touch()
     (tmp_path / "logs").mkdir()
-    assert [run.resolve() for run in find_runs(sorted(tmp_path.iterdir()))] == [tmp_path / "a"]
+    assert [run.resolve() for run in _find_runs(sorted(tmp_path.iterdir()))] == [tmp_path / "a"]
     with pytest.raises(InputError, match="none is not a run"):
-        find_runs([tmp_path / "a", tmp_path / "none"])
+        _find_runs([tmp_path / "a", tmp_path / "none"])
     with pytest.raises(InputError, match="logs is not a run"):
-        find_runs([tmp_path / "logs", tmp_path / "multirun.yaml"])
+        _find_runs([tmp_path / "logs", tmp_path / "multirun.yaml"])
 
 
 def test_a_sweep_of_chains_stands_for_its_runs(tmp_path):
@@ -178,7 +178,7 @@ def test_a_sweep_of_chains_stands_for_its_runs(tmp_path):
             make_run(tmp_path / "sweep" / chain / stage)
         (tmp_path / "sweep" / chain / ".hydra").mkdir()
         (tmp_path / "sweep" / chain / ".hydra" / "config.yaml").touch()  # the sweep's, of no run
-    found = find_runs([tmp_path / "sweep", tmp_path / "sweep" / "1" / "td"])
+    found = _find_runs([tmp_path / "sweep", tmp_path / "sweep" / "1" / "td"])
     assert short_names(found) == ["0/rf1", "0/td", "1/rf1", "1/td"]
     assert short_names(found[:2]) == ["rf1", "td"]
 

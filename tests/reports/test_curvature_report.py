@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from r2flow.noise import Draws
-from r2flow.reports.curvature import curvature_page, curvature_rows, measure_paths, summary
+from r2flow.reports.curvature import _curvature_rows, curvature_page, measure_paths, summary
 from tests.conftest import SENSOR
 from tests.test_sampling import flow
 
@@ -54,7 +54,7 @@ def test_the_figures_are_those_of_paths_kept_whole(batch_size):
     np.testing.assert_allclose(found.trajectories, paths, atol=1e-5)
     row = summary("falling", found)
     assert row["integral"] == pytest.approx(s.mean(), rel=1e-4)
-    rows = curvature_rows({"falling": found})
+    rows = _curvature_rows({"falling": found})
     assert [r["t"] for r in rows] == [k / STEPS for k in range(STEPS)]
     assert rows[3]["s"] == pytest.approx(s[:, 3].mean(), rel=1e-4)
 

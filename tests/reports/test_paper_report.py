@@ -8,8 +8,14 @@ import pytest
 
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.saving import weights_hash
-from r2flow.reports.paper import PaperRun, role_of, same_architecture, scans_figure, table_i
-from r2flow.reports.printed import COLUMNS, TABLE_II
+from r2flow.reports.paper import (
+    COLUMNS,
+    PaperRun,
+    _same_architecture,
+    _scans_figure,
+    _table_i,
+    role_of,
+)
 from tests.conftest import CONFIG, write_run
 from tests.test_sampling import network
 
@@ -42,8 +48,8 @@ def test_every_run_finds_its_role(runs):
 
 
 def test_an_architecture_of_the_paper_is_known_by_its_size():
-    assert same_architecture(80_908_420) is TABLE_II["hdit"]
-    assert same_architecture(50_000_000) is None
+    assert _same_architecture(80_908_420)["frd_printed"] == 122.81
+    assert _same_architecture(50_000_000) == {}
 
 
 def test_an_evaluated_row_stands_below_the_printed_row_of_its_evaluations_and_a_star_tells_another_protocol():
@@ -63,7 +69,7 @@ def test_an_evaluated_row_stands_below_the_printed_row_of_its_evaluations_and_a_
     ]
     lines = [
         [cell.strip() for cell in line.strip("|").split("|")]
-        for line in table_i(rows).splitlines()[2:]
+        for line in _table_i(rows).splitlines()[2:]
     ]
     below = {tuple(a[:3]): b for a, b in itertools.pairwise(lines) if b[1] == "ours"}
     jsd = 3 + list(COLUMNS).index("jsd")
@@ -76,7 +82,7 @@ def test_an_evaluated_row_stands_below_the_printed_row_of_its_evaluations_and_a_
 
 def test_two_models_of_one_role_are_both_drawn(runs):
     both = [PaperRun("1-RF", role, load_checkpoint(run)) for role, run in runs.items()]
-    figure = scans_figure(both, None)
+    figure = _scans_figure(both, None)
     assert (
         sum(text.get_text().startswith("1-RF, ") for axes in figure.axes for text in axes.texts)
         == 3

@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,10 @@ import pytest
 import torch
 
 from r2flow.flow.problems import PROBLEMS
+from r2flow.flow.solvers import solve
+from r2flow.generators import build_generator
+from r2flow.noise import Draws
+from r2flow.reports.savings import savings, savings_text
 from r2flow.reports.solvers import (
     Subject,
     best_within,
@@ -20,6 +25,7 @@ from r2flow.reports.solvers import (
     problem_subjects,
     solvers_page,
 )
+from tests.conftest import CONFIG
 from tests.fields import Field
 from tests.test_sampling import GaussianFlow
 
@@ -104,6 +110,42 @@ def test_the_exact_problems_are_reported_with_what_was_not_solved():
     assert {text.get_size() for text in axes.get_xticklabels(which="both")} == {8}
 
 
+def test_what_comes_after_the_time_has_no_row():
+    chosen = configurations(["euler", "rk4"], [4], [])
+    rows = measure(problem_subjects(["straight"], 2, 4), chosen, until=-1.0)
+    assert [row["method"] for row in rows] == ["euler"]
+
+
+def test_a_saving_is_what_a_flow_leaves_out():
+    flow = build_generator(CONFIG)
+    common, early, *_, channel = savings(flow, 2)
+    x_0 = Draws(0, range(2)).start(flow.noise_shape)
+    part = solve(flow.velocity, x_0, 0.0, 31 / 32, method="dopri5", tolerance=1e-3)
+    assert early["evaluations"] == part.evaluations.double().mean() + 1
+    assert common["evaluations"] == early["whole_evaluations"]
+    assert channel["seconds_share"] == 1
+    assert savings_text([]) == []
+
+
+def test_an_adaptive_sampler_says_what_each_scan_took(r2flow, saved, tmp_path):
+    options = [
+        "--sampler",
+        "dopri5",
+        "--tolerance",
+        "0.5",
+        "--num",
+        "2",
+        "--pictures",
+        "0",
+        "--format",
+        "npy",
+        "--out",
+    ]
+    said = r2flow("sample", saved[0], *options, tmp_path).said
+    each, mean = re.search(r"evaluations of each scan: (.*); mean (.*)\n", said).groups()
+    assert float(mean) == np.mean([int(count) for count in each.split(", ")]) >= 6
+
+
 def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch, caplog):
     # which the verb raises; set back after the test
     caplog.set_level(logging.NOTSET, "r2flow.flow")
@@ -111,9 +153,10 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch, caplog
     def quick(checkpoint, *given, **options):
         # random weights have narrow pulses, which few steps miss
         checkpoint.generator.backbone = GaussianFlow()
-        return checkpoint_subject(checkpoint, *given, steps=16, tolerance=1e-3, **options)
+        return checkpoint_subject(checkpoint, *given, **options | {"steps": 16, "tolerance": 1e-3})
 
     monkeypatch.setattr("r2flow.reports.solvers.checkpoint_subject", quick)
+    monkeypatch.setattr("r2flow.reports.savings.savings", lambda *_: [])
     monkeypatch.setattr("r2flow.plugins._loaded", {"of/mine.py": "of/mine.py"})
     out = tmp_path / "reports"
     options = [

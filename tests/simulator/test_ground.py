@@ -6,12 +6,12 @@ import pytest
 from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS
 from r2flow.simulator.ground import Ground
-from r2flow.simulator.lasers import Rays, along_rows
+from r2flow.simulator.lasers import Rays, _along_rows
 from r2flow.simulator.streets import Street
 
 HDL64E = SENSORS["hdl64e"]
 HEIGHT = HDL64E.height
-RAYS = Rays(along_rows(HDL64E), HDL64E.columns, HEIGHT)
+RAYS = Rays(_along_rows(HDL64E), HDL64E.columns, HEIGHT)
 STRAIGHT = Street(heading=0.0, offset=0.0, curvature=0.0, half_width=4.0, pavement=2.0)
 OPEN = (STRAIGHT._replace(offset=1e6),)  # no street in sight
 

@@ -6,7 +6,7 @@ import pytest
 from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS
 from r2flow.simulator.ground import Ground
-from r2flow.simulator.lasers import Rays, along_rows, lasers_of
+from r2flow.simulator.lasers import Rays, _along_rows, lasers_of
 from r2flow.simulator.raycast import cast
 from r2flow.simulator.scene import SceneBuilder
 from r2flow.simulator.shapes import Blobs, Boxes, Cylinders, Frusta
@@ -22,7 +22,7 @@ def look(*solids, lasers=None):
     b.ground = Ground((Street(0.0, 1e6, 0.0, 4.0, 2.0),))
     for label, solid in solids:
         b.add(solid, 0.0, label, "concrete")
-    rays = Rays(lasers or along_rows(HDL64E), HDL64E.columns, HEIGHT)
+    rays = Rays(lasers or _along_rows(HDL64E), HDL64E.columns, HEIGHT)
     hits = cast(b.build(), rays, np.random.default_rng(1))
     return hits, hits.distance / np.cos(rays.lasers.elevation)[:, None], rays
 

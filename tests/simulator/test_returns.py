@@ -5,9 +5,9 @@ import pytest
 
 from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS
-from r2flow.simulator import observe
+from r2flow.simulator import _observe
 from r2flow.simulator.ground import Ground
-from r2flow.simulator.lasers import HDL64E, RIGS, along_rows, hidden, lasers_of, rows_of
+from r2flow.simulator.lasers import HDL64E, RIGS, _along_rows, hidden, lasers_of, rows_of
 from r2flow.simulator.materials import ALBEDO, INDEX, SWALLOW
 from r2flow.simulator.scene import SceneBuilder
 from r2flow.simulator.shapes import Boxes, Cylinders
@@ -29,7 +29,7 @@ def wall(material: str, distance: float = 10.0, sensor=VLP16, albedo: float | No
     b = builder()
     usual = float(ALBEDO[INDEX[material]]) if albedo is None else albedo
     b.add(Boxes(distance + 5, 0, 0, 10, 200, -1, 100), 0.0, "building", material, usual)
-    return observe(b.build(), sensor, np.random.default_rng(1)), np.abs(
+    return _observe(b.build(), sensor, np.random.default_rng(1)), np.abs(
         sensor.rays().numpy()[1]
     ) < np.pi / 6
 
@@ -102,7 +102,7 @@ def test_grazing_incidence_darkens_a_glossy_wall():
 
 @pytest.mark.parametrize("rig", range(len(RIGS)))
 def test_the_own_car_hides_only_what_is_below(rig):
-    lasers = along_rows(SENSOR)
+    lasers = _along_rows(SENSOR)
     mask = hidden(lasers, 1024, rig)
     assert not mask[lasers.elevation > np.deg2rad(-10)].any()
     assert mask[-1].mean() > 0.3
@@ -127,5 +127,5 @@ def test_a_pixel_keeps_the_nearest_of_several_lasers():
     bar = Cylinders(10, 0, 0.5, 1.6, 1.7)  # seen by two lasers at most
     b.add(bar, 0.0, "pole", "plaster", 0.4)
     assert (
-        observe(b.build(), coarse, np.random.default_rng(1)).labels[:, 512] == LABELS["pole"]
+        _observe(b.build(), coarse, np.random.default_rng(1)).labels[:, 512] == LABELS["pole"]
     ).any()

@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from r2flow import noise
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.errors import InputError
-from r2flow.generators import TransferFlow, build_generator, condition_of
+from r2flow.generators import TransferFlow, build_generator, condition_of, surroundings
 from r2flow.generators.answers import TOGETHER, Answers, smoothed
 from r2flow.generators.surroundings import Surroundings
 from r2flow.lidar.known import Ray, parse_mask, ray_states
@@ -320,6 +320,21 @@ def test_a_ray_between_two_returns_of_its_row_starts_between_them(flow):
     )
     # linear in 1 / r
     assert flow.space.decode(about.start)[0, :, 4, 1].tolist() == pytest.approx([12, 0.5], rel=1e-5)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.002, 0.1])
+@pytest.mark.parametrize("ring", [True, False])
+def test_nearest_returns_are_the_same_in_blocks_and_column_by_column(share, ring, monkeypatch):
+    returned = torch.rand(2, 8, 144, generator=torch.Generator().manual_seed(5)) < share
+    steps = torch.tensor([[0.01, 0.004], [0.007, 0.006]])
+    found = surroundings.nearest_returns(returned, steps, ring)
+    monkeypatch.setattr(surroundings, "_FEW", 144)
+    assert torch.equal(found, surroundings.nearest_returns(returned, steps, ring))
+    left = found[2]  # rows and columns, (2, B, H, W)
+    scan, row, column = left.isfinite().all(0).nonzero().T
+    down, across = left[:, scan, row, column].long()
+    assert returned[scan, row + down, (column + across) % 144].all()
+    assert len(scan) == 0 or share > 0
 
 
 def test_a_coarser_image_has_the_nearest_return_of_each_block(flow):

@@ -15,12 +15,12 @@ from r2flow.lidar.sensors import build_sensor
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.systems.score.generator import (
     Langevin,
-    annealed_langevin,
-    noise_levels,
+    _annealed_langevin,
+    _noise_levels,
+    _step_sizes,
     score_loss,
-    step_sizes,
 )
-from r2flow.systems.score.refinenet import InstanceNormPlus, PooledConv2d, RefineNet
+from r2flow.systems.score.refinenet import RefineNet, _InstanceNormPlus, _PooledConv2d
 from tests.reference import (
     assert_near,
     assert_norms,
@@ -40,7 +40,7 @@ TINY = {
 
 def network_of(case: dict) -> RefineNet:
     model = case["cfg"]["model"]
-    sigmas = noise_levels(
+    sigmas = _noise_levels(
         model["sigma_begin"], model["sigma_end"], model["num_classes"], model["sigma_dist"]
     )
     network = RefineNet(sigmas, case["cfg"]["data"]["channels"], model["ngf"])
@@ -66,7 +66,7 @@ def test_an_image_smaller_than_the_dilation_is_refused():
 
 def test_instance_norm_plus_gives_channels_their_means_back():
     torch.manual_seed(0)
-    norm, x = InstanceNormPlus(4), torch.randn(2, 4, 6, 8) + torch.arange(4.0)[None, :, None, None]
+    norm, x = _InstanceNormPlus(4), torch.randn(2, 4, 6, 8) + torch.arange(4.0)[None, :, None, None]
     # what is left of each channel's mean: gamma alpha standardised + beta
     means = norm(x).mean((2, 3))
     for row, of in zip(means, x, strict=True):
@@ -78,17 +78,17 @@ def test_instance_norm_plus_gives_channels_their_means_back():
 
 
 def test_columns_are_pooled_first_as_published():
-    pooled, x = PooledConv2d(1, 1, 1), torch.tensor([[[[2.0**25, 1.0], [-(2.0**25), 0.0]]]])
+    pooled, x = _PooledConv2d(1, 1, 1), torch.tensor([[[[2.0**25, 1.0], [-(2.0**25), 0.0]]]])
     pooled.load_state_dict({"conv.weight": torch.ones(1, 1, 1, 1), "conv.bias": torch.zeros(1)})
     assert pooled(x).item() == 1 / 4  # rows first, float32 loses the 1
 
 
 def test_noise_levels_and_step_sizes_are_the_published(shared: Path):
     case = load_case(shared, "lidargen_objective.pt")
-    sigmas = noise_levels(50, 0.01, 232)
+    sigmas = _noise_levels(50, 0.01, 232)
     assert_near(sigmas, case["sigmas_232"], 1e-6)
-    assert_near(step_sizes(sigmas, 6.2e-6), case["step_sizes_232"], 1e-6)
-    assert_near(noise_levels(50, 0.01, 232, "uniform"), case["sigmas_uniform"], 1e-6)
+    assert_near(_step_sizes(sigmas, 6.2e-6), case["step_sizes_232"], 1e-6)
+    assert_near(_noise_levels(50, 0.01, 232, "uniform"), case["sigmas_uniform"], 1e-6)
 
 
 @pytest.mark.parametrize("name", ["loss_power2", "loss_power1"])
@@ -122,7 +122,7 @@ def test_annealed_langevin_is_the_published(shared: Path):
     network, own = network_of(case), case["annealed"]
     how = own["sigmas"], lambda k: own["noise"][k - 1], own["step_lr"], own["n_steps_each"]
     with torch.no_grad():
-        path = list(annealed_langevin(network, own["start"], *how))
+        path = list(_annealed_langevin(network, own["start"], *how))
     for state, expected in zip(
         [*path[4:-1:5], path[-1]], [*own["after_each_level"], own["output"]], strict=True
     ):
@@ -131,13 +131,13 @@ def test_annealed_langevin_is_the_published(shared: Path):
 
 def test_langevin_dynamics_draws_from_the_score_s_distribution():
     torch.manual_seed(0)
-    sigmas = noise_levels(2.0, 0.1, 30)
+    sigmas = _noise_levels(2.0, 0.1, 30)
     start = torch.rand(4000, 1, 1, 1)
 
     def score(x, labels):  # of N(3, 1) and the level's noise
         return (3 - x) / (1 + sigmas[labels][:, None, None, None] ** 2)
 
-    *_, end = annealed_langevin(
+    *_, end = _annealed_langevin(
         score, start, sigmas, lambda _: torch.randn_like(start), rate=1e-3, steps=20
     )
     assert end.mean().item() == pytest.approx(3, abs=0.1)

@@ -30,15 +30,15 @@ from r2flow.samplers import build_sampler
 from r2flow.systems.diffusion.process import PREDICTIONS, noised, walk
 from r2flow.systems.diffusion.schedules import square_root_linear
 from r2flow.systems.latent.autoencoder import Autoencoder
-from r2flow.systems.latent.generator import some_of
+from r2flow.systems.latent.generator import _some_of
 from r2flow.systems.latent.published import _autoencoder, _unet, _within
 from r2flow.systems.latent.quantiser import Quantiser
 from r2flow.systems.latent.stage import (
-    PatchDiscriminator,
-    adaptive_weight,
-    adversarial_factor,
-    hinge_loss,
-    reconstruction_loss,
+    _adaptive_weight,
+    _adversarial_factor,
+    _hinge_loss,
+    _PatchDiscriminator,
+    _reconstruction_loss,
     returns,
 )
 from r2flow.systems.latent.unet import LatentUNet
@@ -193,7 +193,7 @@ def test_ddim_is_the_published(diffusion: dict[str, Any], name: str):
         diffusion["log_snr"],
         diffusion["autoencoder"].decode,
     )
-    times = some_of(len(log_snr), case["steps"])
+    times = _some_of(len(log_snr), case["steps"])
 
     def clean(z: Tensor, t: Tensor) -> Tensor:
         return PREDICTIONS["eps"].split(z, diffusion["unet"](z, t.expand(len(z))), log_snr[t])[0]
@@ -209,7 +209,7 @@ def test_ddim_is_the_published(diffusion: dict[str, Any], name: str):
 
 @pytest.mark.parametrize("name", ["S50", "S30", "S7"])
 def test_subsets_of_steps_are_the_published(diffusion: dict[str, Any], name: str):
-    case, times = diffusion["ddim_tables"][name], some_of(1000, int(name[1:])).flip(0)
+    case, times = diffusion["ddim_tables"][name], _some_of(1000, int(name[1:])).flip(0)
     assert torch.equal(times, case["timesteps"])
     alphas = diffusion["log_snr"].sigmoid()
     assert_near(alphas[times], case["alphas"], 1e-5)
@@ -220,16 +220,16 @@ def test_subsets_of_steps_are_the_published(diffusion: dict[str, Any], name: str
 def test_adversarial_losses_and_gradients_are_the_published(shared: Path, step: int):
     case = load_case(shared, "lidm_ae_loss.pt")
     cfg = case["cfg"]
-    model = PatchDiscriminator(cfg["disc_in_channels"], cfg["disc_ndf"], cfg["disc_num_layers"])
+    model = _PatchDiscriminator(cfg["disc_in_channels"], cfg["disc_ndf"], cfg["disc_num_layers"])
     model.load_state_dict(case["discriminator"])
     last, factor = (
         case["last_layer"].clone().requires_grad_(),
-        adversarial_factor(step, cfg["disc_start"], True),
+        _adversarial_factor(step, cfg["disc_start"], True),
     )
     made = F.conv2d(case["features"], last)
     expected = case["cases"][f"step{step}_ae"]
-    reconstruction, adversarial = reconstruction_loss(case["inputs"], made), -model(made).mean()
-    weight = adaptive_weight(reconstruction, adversarial, last, cfg["disc_weight"])
+    reconstruction, adversarial = _reconstruction_loss(case["inputs"], made), -model(made).mean()
+    weight = _adaptive_weight(reconstruction, adversarial, last, cfg["disc_weight"])
     assert_near(weight, expected["log"]["train/d_weight"], 1e-4)
     assert_near(adversarial, expected["log"]["train/g_loss"], 1e-4)
     loss = (
@@ -244,15 +244,15 @@ def test_adversarial_losses_and_gradients_are_the_published(shared: Path, step: 
     model.load_state_dict(case["discriminator"])
     model.zero_grad()
     expected = case["cases"][f"step{step}_disc"]
-    loss = factor * hinge_loss(model(case["inputs"]), model(made.detach()))
+    loss = factor * _hinge_loss(model(case["inputs"]), model(made.detach()))
     assert loss.item() == pytest.approx(expected["loss"], rel=1e-4)
     loss.backward()
     assert_norms(model, expected["grad_disc_norms"])
 
 
 def test_the_discriminator_begins_at_its_step_and_ends_there_as_published():
-    assert [adversarial_factor(step, 2) for step in range(5)] == [0, 0, 1, 1, 1]
-    assert [adversarial_factor(step, 2, inverted=True) for step in range(5)] == [1, 1, 1, 0, 0]
+    assert [_adversarial_factor(step, 2) for step in range(5)] == [0, 0, 1, 1, 1]
+    assert [_adversarial_factor(step, 2, inverted=True) for step in range(5)] == [1, 1, 1, 0, 0]
 
 
 def test_ranges_and_masks_are_encoded_and_decoded_as_published(shared: Path):
@@ -542,7 +542,7 @@ def test_a_masked_autoencoder_drops_what_its_mask_denies():
     assert torch.equal(decoded[raw[:, 1:] >= 0], raw[:, :1][raw[:, 1:] >= 0])
     x, mask = torch.rand(2, 1, 8, 32), torch.ones(2, 1, 8, 32)
     expected = ((x - raw[:, :1]).abs().mean() + 0.5 * (1 - raw[:, 1:]).abs().mean()) / 2
-    torch.testing.assert_close(reconstruction_loss(x, raw, mask, 0.5), expected)
+    torch.testing.assert_close(_reconstruction_loss(x, raw, mask, 0.5), expected)
 
 
 FULL = {"lidargen": 29_694_082, "lidm_autoencoder": 15_070_361, "r2dm": 31_099_650}

@@ -23,14 +23,14 @@ from r2flow.samplers import build_sampler
 from r2flow.systems.diffusion.generator import Diffusion
 from r2flow.systems.diffusion.process import (
     PREDICTIONS,
+    _forward_step,
     alpha_sigma,
-    forward_step,
     noised,
     repaint,
     step,
     walk,
 )
-from r2flow.systems.diffusion.schedules import DISCRETE, SCHEDULES, Cosine
+from r2flow.systems.diffusion.schedules import DISCRETE, SCHEDULES, _Cosine
 from r2flow.systems.diffusion.stage import LearnDiffusion
 from tests.reference import assert_near, assert_norms, assert_published, backbone_of, load_case
 
@@ -87,7 +87,7 @@ def test_schedules_of_steps_are_the_published(shared):
 
 def test_loss_weights_are_the_published(shared):
     case = load_case(shared, "r2dm_schedules.pt")
-    log_snr = Cosine()(case["t"])
+    log_snr = _Cosine()(case["t"])
     for name, theirs in (("eps", "eps"), ("v", "v"), ("x", "x_0")):
         for kind, gamma in (("minsnr", 5.0), ("plain", None)):
             expected = case["loss_weight_cosine"][f"{theirs}_{kind}"]
@@ -179,7 +179,7 @@ def test_repaint_draws_as_often_as_its_steps_parts_and_repeats_say():
 
     known = torch.ones(1, 1, 2, 2)
     mask = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
-    log_snrs = Cosine()(torch.linspace(1, 0, 13, dtype=torch.float64))
+    log_snrs = _Cosine()(torch.linspace(1, 0, 13, dtype=torch.float64))
     states = list(
         repaint(lambda z, _: torch.zeros_like(z), known, known, mask, log_snrs, noise, 2, 4)
     )
@@ -284,10 +284,10 @@ def test_forward_steps_add_up_to_the_noise_of_their_end():
     (alpha, sigma), (last_alpha, last_sigma) = alpha_sigma(lambdas[0]), alpha_sigma(lambdas[-1])
     signal, variance = alpha * one, sigma.square() * one
     for here, there in pairwise(lambdas):
-        kept = forward_step(one, here, there, zero)
+        kept = _forward_step(one, here, there, zero)
         signal, variance = (
             kept * signal,
-            kept.square() * variance + forward_step(zero, here, there, one).square(),
+            kept.square() * variance + _forward_step(zero, here, there, one).square(),
         )
     torch.testing.assert_close(signal, last_alpha * one)
     torch.testing.assert_close(variance, last_sigma.square() * one)
@@ -357,7 +357,7 @@ def test_a_cosine_schedule_has_its_digits_up_to_its_ends(farthest):
     )
     expected = 2 * (cosine.log() - sine.log())
     torch.testing.assert_close(
-        Cosine(-farthest, farthest)(t).double(), expected, rtol=0, atol=0.005
+        _Cosine(-farthest, farthest)(t).double(), expected, rtol=0, atol=0.005
     )
 
 
@@ -369,4 +369,4 @@ def test_a_cosine_schedule_whose_ends_are_no_numbers_is_one_line(ends):
     with pytest.raises(
         InputError, match="falls from highest to lowest, both within 20 of 0; found"
     ):
-        Cosine(**ends)
+        _Cosine(**ends)

@@ -1,4 +1,5 @@
-"""Scan files: KITTI .bin, nuScenes .pcd.bin, PCD, PLY, NPY, tables, LAS and published samples.
+"""Scan files: KITTI .bin, nuScenes .pcd.bin, PCD, PLY, NPY, tables, LAS, published samples and
+PandaSet.
 
 All are read; .bin, PCD, PLY and NPY are written.
 
@@ -12,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 
-from r2flow.errors import InputError, warn_odd
+from r2flow.errors import IN_MEMORY, InputError, naming, warn_odd
 from r2flow.files import atomic_write, reading
-from r2flow.lidar.scan_files import clouds, samples, tables
+from r2flow.lidar.scan_files import clouds, pandaset, samples, tables
 from r2flow.lidar.scan_files.points import (
     FARTHEST,
     Points,
@@ -26,9 +27,16 @@ from r2flow.lidar.scan_files.points import (
 from r2flow.lidar.scan_files.points import NoPointsError as NoPointsError
 
 _ROWS = (".pcd.bin", ".bin")  # rows of float32; the one that ends with the other first
-_READERS = clouds.READERS | tables.READERS | samples.READERS
+TABLE_ENDINGS = (".pkl.gz", ".pkl")  # PandaSet's frames, and other files of its folders
+_READERS = (
+    clouds.READERS
+    | tables.READERS
+    | samples.READERS
+    | dict.fromkeys(TABLE_ENDINGS, pandaset.read_frame)
+)
 # Endings of formats that are not read, with advice on conversion.
 ELSEWHERE = {
+    TABLE_ENDINGS: "is read if it is PandaSet's: data=pandaset, in a verb pandaset:FOLDER",
     (".mcap", ".db3", ".bag"): ("holds many scans: r2flow unpack {path} --out FOLDER writes them"),
     (".pcap", ".pcapng", ".osf"): (
         "holds packets, which the maker's tool turns into scans (Ouster: ouster-cli source {path} "
@@ -36,7 +44,7 @@ ELSEWHERE = {
         "ROS driver and r2flow unpack)"
     ),
     (".laz", ".e57", ".pts", ".ptx", ".rcp", ".fls"): "is read by CloudCompare, which saves .ply",
-    (".npz", ".h5", ".hdf5", ".zarr", ".mat", ".pkl", ".tfrecord"): (
+    (".npz", ".h5", ".hdf5", ".zarr", ".mat", ".tfrecord"): (
         "holds arrays: write x, y, z, intensity of each scan by numpy.save"
     ),
     (".lvx", ".lvx2", ".lvx3"): "is of a Livox, which has no beams; r2flow needs a spinning LiDAR",
@@ -45,7 +53,9 @@ ELSEWHERE = {
 WRITTEN = (".bin", ".pcd", ".ply", ".npy")
 SCAN_ENDINGS = (*_ROWS, *_READERS)
 LOOSE_ENDINGS = (".csv", ".txt", ".pth")  # also used for other files than scans
-FIRM_ENDINGS = tuple(ending for ending in SCAN_ENDINGS if ending not in LOOSE_ENDINGS)
+FIRM_ENDINGS = tuple(
+    ending for ending in SCAN_ENDINGS if ending not in LOOSE_ENDINGS + TABLE_ENDINGS
+)
 
 FARTHEST_RAY = 400.0  # metres; no spinning LiDAR measures farther
 LARGEST_FILE = 1 << 30  # bytes: 67 million points, hundreds of scans; more exhausts the memory
@@ -58,8 +68,9 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
     z intensity ring. .pcd, .ply, .las, .feather, .parquet: fields x y z and, where present,
     intensity (or reflectance, reflectivity, remission, i) and ring (or channel), of any type.
     .npy: (N, 3) or (N, 4), or named fields. .csv, .xyz, .txt: three or four columns, or columns
-    named in the first line. .pth: the samples of the published R2Flow code. LAS, Arrow tables and
-    compressed PCDs need the extra `formats`.
+    named in the first line. .pth: samples of the published R2Flow and R2DM code. .pkl.gz, .pkl: a
+    frame of PandaSet (`pandaset.read_frame`). LAS, Arrow tables and compressed PCDs need the extra
+    `formats`.
 
     Args:
         columns: Names of the columns of a .bin, .npy or text file without names: x, y, z and, where
@@ -98,6 +109,17 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
         points = column_points(names, arrays, raw)
         if stored:
             warn_of_unused(path, names, arrays, points)
+    return _tell_dropped(path, points)
+
+
+def points_in_memory(rows: ndarray) -> Points:
+    """The points of an array (N, 3 or 4): x, y, z and reflectance, as `read_points` of a file."""
+    with naming(IN_MEMORY):
+        points = column_points(tables.usual_names(rows.shape[1], None), [*rows.T])
+    return _tell_dropped(Path(IN_MEMORY), points)
+
+
+def _tell_dropped(path: Path, points: Points) -> Points:
     if points.dropped:
         kind = f"points that are NaN, infinite or beyond {FARTHEST:g} m are dropped"
         warn_odd(path, kind, points.dropped)

@@ -1,4 +1,6 @@
-"""Samples of the published R2Flow code: dictionaries of tensors in .pth files.
+"""Samples of the published codes of R2Flow and R2DM: tensors in .pth files.
+
+R2Flow's are dictionaries, R2DM's the same tensors stacked, (5, H, W):
 
     {"depth": (1, H, W) in metres, "xyz": (3, H, W) in metres, "reflectance": (1, H, W) in [0, 1]}
 
@@ -28,12 +30,14 @@ def _read(path: Path) -> dict[str, ndarray]:
         if damaged := archive.testzip():  # torch does not compare checksums
             raise InputError(f"its part {damaged} is damaged; fetch or write it again.")
     stored = torch.load(path, map_location="cpu", weights_only=True)
+    if isinstance(stored, torch.Tensor) and stored.shape[:1] == (5,):  # R2DM's
+        stored = dict(zip(_CHANNELS, stored.split([1, 3, 1]), strict=True))
     sample: dict[str, torch.Tensor] = {}
     for name, channels in _CHANNELS.items():
         tensor = stored.get(name) if isinstance(stored, dict) else None
         if not isinstance(tensor, torch.Tensor):
             raise InputError(
-                "it is no sample of the published R2Flow code, which holds the tensors "
+                "it is no sample of the published R2Flow or R2DM code, which holds the tensors "
                 f"{', '.join(_CHANNELS)}. Is it a file of weights?"
             )
         shape = tuple(tensor.shape)

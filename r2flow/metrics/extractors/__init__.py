@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from r2flow.metrics.extractors.base import Extractor
 
 
-class Extractors(Registry["type[Extractor]"]):
+class _Extractors(Registry["type[Extractor]"]):
     """Registry of networks that also registers their metrics."""
 
     def add(self, name: str, entry: type[Extractor]) -> None:
@@ -20,7 +20,7 @@ class Extractors(Registry["type[Extractor]"]):
         add_network(name)
 
 
-EXTRACTORS = Extractors(
+EXTRACTORS = _Extractors(
     "extractor",
     handcrafted=lazy("r2flow.metrics.extractors.handcrafted:Handcrafted"),
     handcrafted_range=lazy("r2flow.metrics.extractors.handcrafted:HandcraftedRange"),

@@ -7,7 +7,7 @@ and stores it as safetensors in the folder of weights, from which `Extractor.tra
 import io
 import tarfile
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Self
 
@@ -38,6 +38,8 @@ SOURCES: Registry[str] = Registry(
 
 # Parameter files in an archive.
 PARTS = ("backbone", "segmentation_decoder", "segmentation_head", "model.ckpt")
+Tensors = dict[str, Tensor]  # by name
+
 LARGEST = 2**31  # maximum file size in bytes; the largest network has 0.2 GB
 
 
@@ -58,7 +60,7 @@ class Extractor(nn.Module, ABC):
         """Features (B, D), float32; NaN for a scan without returns."""
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Self:
+    def from_tensors(cls, tensors: Tensors) -> Self:
         """Build the network from published tensors by name, with sizes from them."""
         return cls().filled(tensors)
 
@@ -77,7 +79,7 @@ class Extractor(nn.Module, ABC):
         extractor.weights = weights_hash(extractor)
         return extractor
 
-    def filled(self, tensors: Mapping[str, Tensor]) -> Self:
+    def filled(self, tensors: Tensors) -> Self:
         """Load exactly these parameters and switch to evaluation mode."""
         try:
             self.load_state_dict(dict(tensors))
@@ -116,7 +118,7 @@ def add(name: str, path: Path) -> str:
     Returns the first 12 digits of the SHA-256 of the parameters, independent of the file format.
     """
     SOURCES[name]
-    tensors = read_published(path)
+    tensors = _read_published(path)
     with reading_errors(path):
         weights = weights_hash(EXTRACTORS[name].from_tensors(tensors))
     whole = {name: tensor.clone().contiguous() for name, tensor in tensors.items()}
@@ -131,13 +133,13 @@ def weights_hash(extractor: Extractor) -> str:
     return state_hash(tensors)[:12]
 
 
-def read_published(path: Path) -> dict[str, Tensor]:
+def _read_published(path: Path) -> Tensors:
     """Read tensors by name from a file, an archive or a folder."""
     with reading_errors(path) if path.is_dir() else reading(path, LARGEST, "file of weights"):
         if path.suffix == ".safetensors":
             return read_tensors(path)[0]
-        tensors: dict[str, Tensor] = {}
-        files: set[str] = set()
+        tensors: Tensors = {}
+        files = set()
         for name, content in _contents(path):
             if name in files:
                 raise InputError(f"it holds several networks ('{name}' twice).")

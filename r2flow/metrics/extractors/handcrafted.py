@@ -10,10 +10,12 @@ Statistics, bands, sectors and scale were chosen on half of a set of corruptions
 
 from collections.abc import Iterator
 from itertools import pairwise
+from pathlib import Path
 from typing import Self
 
 import torch
 import torch.nn.functional as F
+import yaml
 from torch import Tensor
 
 from r2flow.metrics.extractors.base import Extractor
@@ -34,64 +36,10 @@ SPREAD = ", spread"
 BEAMS = ", beams"
 SECTORED = ", sectors"
 
-# Features are (x - centre) / spread, by mean and standard deviation over simulated hdl64e scans.
-SCALES = {
-    "returns": (0.76, 0.029),
-    "row changes": (0.026, 0.009),
-    "column changes": (0.2, 0.019),
-    "single losses": (0.0034, 0.0013),
-    "single returns": (0.0018, 0.0011),
-    "log-range": (3.3, 0.2),
-    "beyond 0 m": (0.11, 0.055),
-    "beyond 5 m": (0.36, 0.092),
-    "beyond 10 m": (0.19, 0.063),
-    "beyond 20 m": (0.077, 0.04),
-    "beyond 40 m": (0.029, 0.023),
-    "row step": (-5.0, 0.23),
-    "row edges": (0.042, 0.011),
-    "row slant": (0.0004, 0.0079),
-    "row equal": (0.13, 0.025),
-    "row step of 8": (-3.1, 0.41),
-    "row step of 64": (-0.54, 0.55),
-    "row bend": (-4.8, 0.25),
-    "row bend sign": (0.022, 0.0048),
-    "row smooth": (0.095, 0.067),
-    "column step": (-2.6, 0.49),
-    "column edges": (0.14, 0.06),
-    "column slant": (-0.29, 0.069),
-    "column bend": (-3.2, 0.37),
-    "column bend sign": (0.018, 0.0093),
-    "rows agree": (0.23, 0.062),
-    "diagonals": (0.0043, 0.018),
-    "reflectance": (0.27, 0.032),
-    "reflectance from 0": (0.1, 0.041),
-    "reflectance from 0.1": (0.2, 0.049),
-    "reflectance from 0.25": (0.42, 0.073),
-    "reflectance from 0.5": (0.041, 0.036),
-    "reflectance row step": (-4.7, 0.14),
-    "reflectance row smooth": (-0.24, 0.011),
-    "reflectance row bend": (-3.9, 0.14),
-    "reflectance column step": (-4.1, 0.13),
-    "reflectance at edges": (0.16, 0.035),
-    "reflectance rows agree": (0.012, 0.0061),
-    "reflectance with range": (-0.19, 0.063),
-    "log-range, spread": (0.54, 0.076),
-    "row step, spread": (1.7, 0.15),
-    "row bend, spread": (2.0, 0.16),
-    "column step, spread": (1.8, 0.15),
-    "column bend, spread": (1.9, 0.12),
-    "reflectance, spread": (0.14, 0.019),
-    "returns, beams": (0.16, 0.033),
-    "log-range, beams": (0.076, 0.025),
-    "row step, beams": (0.17, 0.061),
-    "reflectance, beams": (0.065, 0.015),
-    "returns, sectors": (0.76, 0.046),
-    "log-range, sectors": (3.4, 0.29),
-    "beyond 0 m, sectors": (0.11, 0.098),
-    "row edges, sectors": (0.042, 0.018),
-    "row step, sectors": (-4.9, 0.33),
-    "reflectance, sectors": (0.26, 0.05),
-}
+# Centre and spread of each statistic, by name.
+SCALES: dict[str, list[float]] = yaml.safe_load(
+    Path(__file__).with_name("handcrafted.yaml").read_text(encoding="utf-8")
+)
 
 
 def _statistics(r: Tensor, q: Tensor | None) -> Iterator[tuple[str, Tensor, Tensor]]:
@@ -214,23 +162,22 @@ class Handcrafted(Extractor):
 
     def _features(self, images: Tensor) -> Tensor:
         h, w = images.shape[2:]
-        found: dict[str, tuple[Tensor, Tensor]] = {}
+        found = {}
         q = images[:, 1] if self.needs_reflectance else None
         for name, x, where in _statistics(images[:, 0], q):
             masked = x * where
             sums = masked.sum(-1)
             counts = where.sum(-1)
-            mean, share = _cells(sums, counts, BANDS, w)
-            found[name] = mean, share
+            mean, share = found[name] = _cells(sums, counts, BANDS, w)
             if name + SPREAD in self.scales:
                 square, _ = _cells(torch.linalg.vecdot(masked, x), counts, BANDS, w)
-                found[name + SPREAD] = (square - mean**2).clamp(min=0).sqrt(), share
+                spread = (square - mean**2).clamp(min=0).sqrt()
+                found[name + SPREAD] = torch.stack([spread, share])
             if name + BEAMS in self.scales:
                 found[name + BEAMS] = _unevenness(sums, counts)
             if name + SECTORED in self.scales:
                 found[name + SECTORED] = _cells(masked.sum(-2), where.sum(-2), SECTORS, h)
-        values = torch.cat([found[name][0] for name in self.scales], 1)
-        shares = torch.cat([found[name][1] for name in self.scales], 1)
+        values, shares = torch.cat([found[name] for name in self.scales], 2)
         centre, spread = self.table.T
         x = (values - centre) / spread * (shares / (shares + FEW))
         return FAR_OUT * torch.asinh(x / FAR_OUT)
@@ -243,16 +190,16 @@ class HandcraftedRange(Handcrafted):
     needs_reflectance = False
 
 
-def _cells(total: Tensor, count: Tensor, cells: int, rays: int) -> tuple[Tensor, Tensor]:
-    """Means over equal parts of rows or columns, (B, cells), and the shares counted.
+def _cells(total: Tensor, count: Tensor, cells: int, rays: int) -> Tensor:
+    """Means over equal parts of rows or columns, and the shares counted, (2, B, cells).
 
     From sums and counts, (B, n).
     """
     n = F.adaptive_avg_pool1d(count, cells)
-    return F.adaptive_avg_pool1d(total, cells) / n.clamp(min=1e-6), n / rays
+    return torch.stack([F.adaptive_avg_pool1d(total, cells) / n.clamp(min=1e-6), n / rays])
 
 
-def _unevenness(total: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+def _unevenness(total: Tensor, count: Tensor) -> Tensor:
     """|x(h - 1) - 2 x(h) + x(h + 1)| of row means x, as in `_cells`, where all three exist."""
     mean = total / count.clamp(min=1)
     valid = (count > 0).to(total)

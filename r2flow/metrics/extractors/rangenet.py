@@ -9,14 +9,13 @@ translated.
 import random
 import re
 from abc import abstractmethod
-from collections.abc import Mapping
 from typing import Self
 
 import torch
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
-from r2flow.metrics.extractors.base import Extractor
+from r2flow.metrics.extractors.base import Extractor, Tensors
 from r2flow.metrics.scans import Scans
 
 WIDTHS = (32, 64, 128, 256, 512, 1024)
@@ -62,7 +61,7 @@ class _Level(nn.Module):
         return self.residual_blocks(self.conv(x))
 
 
-class RangeNet(Extractor):
+class _RangeNet(Extractor):
     """RangeNet of 21 or 53 layers on range, x, y, z and optionally reflectance.
 
     Features precede the segmentation head of `num_classes` (0: no head).
@@ -92,7 +91,7 @@ class RangeNet(Extractor):
         self.register_buffer("mean", statistics[0], persistent=False)
         self.register_buffer("std", statistics[1], persistent=False)
 
-    def normalise(self, image: Tensor) -> Tensor:
+    def _normalise(self, image: Tensor) -> Tensor:
         """(image - mean) / std at pixels with a return, else 0; (B, 4 or 5, H, W), range first."""
         return (image - self.mean) / self.std * (image[:, :1] > 0)
 
@@ -116,19 +115,19 @@ class RangeNet(Extractor):
             )
         reflectance = scans.images[:, 1 : 1 + self.needs_reflectance]
         image = torch.cat([scans.images[:, :1], scans.xyz, reflectance], 1).to(self.device)
-        return scans.nan_where_empty(self.pool(self(self.normalise(image))))
+        return scans.nan_where_empty(self.pool(self(self._normalise(image))))
 
     @abstractmethod
     def pool(self, maps: Tensor) -> Tensor:
         """Map decoder maps (B, C, H, W) to features (B, D)."""
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Self:
-        tensors = {translate(name): tensor for name, tensor in tensors.items()}
+    def from_tensors(cls, tensors: Tensors) -> Self:
+        tensors = {_translate(name): tensor for name, tensor in tensors.items()}
         return cls(len(tensors.get("head.1.bias", ()))).filled(tensors)
 
 
-class RangeNet53(RangeNet):
+class RangeNet53(_RangeNet):
     """FRD's network on range and reflectance; features are a fixed random choice of 4096 values."""
 
     name = "rangenet53"
@@ -144,7 +143,7 @@ class RangeNet53(RangeNet):
         return flat[:, torch.tensor(indices, device=maps.device)]
 
 
-class RangeNet21(RangeNet):
+class RangeNet21(_RangeNet):
     """FRID's network on range; features are means of the decoder map over 16 bands of rows.
 
     They were published as "depth".
@@ -178,7 +177,7 @@ NAMES = (
 )
 
 
-def translate(name: str) -> str:
+def _translate(name: str) -> str:
     """Translate a parameter name of the original release; keep names of r2flow."""
     for pattern, replacement in NAMES:
         name = re.sub(pattern, replacement, name)

@@ -9,7 +9,7 @@ weights) and the features are not verified.
 """
 
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.errors import InputError
-from r2flow.metrics.extractors.base import Extractor
+from r2flow.metrics.extractors.base import Extractor, Tensors
 from r2flow.metrics.extractors.sparse import (
     Sparse,
     SparseConv3d,
@@ -37,7 +37,7 @@ FAR = 56.0
 WIDTHS = (16, 16, 32, 64, 128, 128, 64, 48, 48)  # stem, four levels down, four up
 
 
-def voxelise(points: Tensor) -> tuple[Tensor, Tensor]:
+def _voxelise(points: Tensor) -> tuple[Tensor, Tensor]:
     """Occupied voxels of 5 cm of one scan's points in metres, (N, 3) float32, and their features.
 
     Coordinates are round(p / 0.05) minus their minimum, (M, 3) int64, in the order of the first
@@ -53,7 +53,7 @@ def voxelise(points: Tensor) -> tuple[Tensor, Tensor]:
     return coords[first], F.pad(points[first], (0, 1), value=-1.0)
 
 
-def mean_by_distance(features: Tensor, coords: Tensor) -> Tensor:
+def _mean_by_distance(features: Tensor, coords: Tensor) -> Tensor:
     """Means over 16 sectors of distance from the voxels' centroid, the published "depth".
 
     Features are (M, C), means (16 C,), C fastest. Voxels 56 m or more from the centroid are
@@ -138,8 +138,8 @@ class MinkowskiNet(Extractor):
             if self.has_points and level in (1, 3):
                 corners = _Corners(coords, y.grid, 2 ** (5 - level))
                 transformed = self.point_transforms[level // 2](points)
-                points = corners.to_points(y.features) + transformed
-                y = y._replace(features=corners.to_voxels(points))
+                points = corners._to_points(y.features) + transformed
+                y = y._replace(features=corners._to_voxels(points))
             y = self.get_submodule(f"up{level}.0")(y)
             both = torch.cat([y.features, maps[4 - level].features], 1)
             y = self.get_submodule(f"up{level}.1")(y._replace(features=both))
@@ -153,12 +153,12 @@ class MinkowskiNet(Extractor):
         means = torch.full((len(scans), self.dim), torch.nan, device=self.device)
         for row, points in zip(means, scans.points, strict=True):
             if len(points):
-                coords, features = voxelise(points.to(self.device))
-                row[:] = mean_by_distance(self(coords, features), coords)
+                coords, features = _voxelise(points.to(self.device))
+                row[:] = _mean_by_distance(self(coords, features), coords)
         return means
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Self:
+    def from_tensors(cls, tensors: Tensors) -> Self:
         levels = ["stem.0"]
         levels += [f"stage{level}.1.net.0" for level in range(1, 5)]
         levels += [f"up{level}.0.net.0" for level in range(1, 5)]
@@ -199,7 +199,7 @@ class _Corners:
         weights = torch.where(corners > 0, share, 1 - share).prod(2) * (self.corners >= 0)
         self.weights = weights / (weights.sum(1, keepdim=True) + 1e-8)
 
-    def to_points(self, features: Tensor) -> Tensor:
+    def _to_points(self, features: Tensor) -> Tensor:
         """Interpolate voxel features (M, C) at the points: (N, C).
 
         Over the existing ones of eight corners.
@@ -208,7 +208,7 @@ class _Corners:
         weights = self.weights.to(features)
         return F.embedding_bag(corners, features, mode="sum", per_sample_weights=weights)
 
-    def to_voxels(self, features: Tensor) -> Tensor:
+    def _to_voxels(self, features: Tensor) -> Tensor:
         """Average point features (N, C) per voxel: (M, C)."""
         total = features.new_zeros(self.num, features.shape[1])
         total.index_add_(0, self.voxels, features)

@@ -20,6 +20,7 @@ from string import Template
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy import ndarray
 from torch import Tensor
 
 from r2flow.errors import InputError, printable
@@ -36,9 +37,9 @@ class Panel(NamedTuple):
     """One scan of a page, or a sequence of scans for the slider."""
 
     caption: str
-    images: np.ndarray  # range in metres and reflectance, (T, 2 or 1, H, W); 0 for dropped rays
+    images: ndarray  # range in metres and reflectance, (T, 2 or 1, H, W); 0 for dropped rays
     rays: Tensor  # elevation and azimuth in radians, (2, H, W)
-    labels: np.ndarray | None = None  # semantic ids, (T, H, W)
+    labels: ndarray | None = None  # semantic ids, (T, H, W)
     frames: Sequence[str] = ()  # slider captions
 
 
@@ -95,7 +96,7 @@ def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
                 "caption": printable(panel.caption),
                 "rays": sensors[key],
                 "frames": [
-                    packed_image(image, step, numbers)
+                    _packed_image(image, step, numbers)
                     for image, numbers in zip(panel.images, classified, strict=True)
                 ],
                 "reflectance": panel.images.shape[1] > 1,
@@ -132,7 +133,7 @@ def most_images(shape: Sequence[int]) -> int:
     return MOST // int(np.prod(shape[-2:]))
 
 
-def packed_image(image: np.ndarray, step: float, numbers: np.ndarray | None = None) -> str:
+def _packed_image(image: ndarray, step: float, numbers: ndarray | None = None) -> str:
     """Encode an image, (2 or 1, H, W), as byte planes of H W each, compressed by zlib, in base64.
 
     Planes: high and low bytes of range codes, as differences along each row modulo 2^16; optionally
@@ -149,7 +150,7 @@ def packed_image(image: np.ndarray, step: float, numbers: np.ndarray | None = No
     return _base64(zlib.compress(b"".join(planes), 6))
 
 
-def _described(rays: np.ndarray) -> dict[str, Any]:
+def _described(rays: ndarray) -> dict[str, Any]:
     """Rays, (2, H, W), as elevations of rows and azimuths of columns, which all sensors have."""
     elevations = rays[0, :, 0]
     azimuths = rays[1, 0]
@@ -164,7 +165,7 @@ def _described(rays: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _class_numbers(ids: np.ndarray, classes: dict[int, tuple[str, str]]) -> np.ndarray:
+def _class_numbers(ids: ndarray, classes: dict[int, tuple[str, str]]) -> ndarray:
     """Class number of each id, from 1, (T, H, W); 0 for ids without a class."""
     table = np.zeros(int(max(ids.max(), *classes, 0)) + 1, np.uint8)
     table[list(classes)] = np.arange(1, len(classes) + 1)

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy import ndarray
 
-from r2flow.data.opening import describe, find_drives, open_scans
+from r2flow.data.opening import SOURCES, describe, find_drives, open_scans
 from r2flow.data.options import FOLDER, SIMULATED
 from r2flow.data.reading import Reading, estimated_scale, read_labelled_scan
 from r2flow.data.sets import ScanSet
@@ -30,10 +31,17 @@ from r2flow.simulator import simulate
 
 
 def list_scans(path: Path, most: int) -> tuple[list[Path], int]:
-    """A scan file, or up to `most` scans of a folder, evenly spread; and the number of all."""
-    if not path.is_dir():
+    """A scan file, or up to `most` scans of a folder or `NAME:FOLDER`, evenly spread; and the
+    number of all.
+    """
+    name, _, root = str(path).partition(":")
+    if name in SOURCES and not path.exists():
+        drives = find_drives(name, root)
+    elif path.is_dir():
+        drives = find_drives(FOLDER, path)
+    else:
         return [path], 1
-    paths = [Path(scan) for drive in find_drives(FOLDER, path) for scan in drive.scans]
+    paths = [Path(scan) for drive in drives for scan in drive.scans]
     return [paths[index] for index in spread(len(paths), most)], len(paths)
 
 
@@ -60,7 +68,7 @@ def scan_panels(
     The caption is the file name, with folders if names are ambiguous. Files not written by r2flow
     are opened one by one, since sizes of range images and reflectance may differ.
     """
-    views: list[tuple[str, Path, ScanSet, int]] = []
+    views = []
     for spec, reading in readings.items():
         reading = replace(reading, on_bad_scan="error")
         described = describe(spec)
@@ -84,7 +92,7 @@ def scan_panels(
         yield spec, Panel(caption, image[None], scans.sensor.rays(), classes)
 
 
-def _read_labels(source: ScanSource, number: int) -> np.ndarray | None:
+def _read_labels(source: ScanSource, number: int) -> ndarray | None:
     """Semantic ids of a scan, (1, H, W), if it has any."""
     if isinstance(source, SimulatedScans):
         return simulate(source.sensor, source.seed, source.numbers[number]).labels[None]

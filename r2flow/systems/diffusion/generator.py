@@ -1,6 +1,5 @@
 """Diffusion models: a network that predicts noise or data, sampled by diffusion or as a flow."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +9,7 @@ from torch import Tensor
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.flow import NetworkFlow
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.registry import Positive, Share
+from r2flow.registry import Options, Positive, Share
 from r2flow.samplers import MMPS, Repaint
 from r2flow.samplers.base import (
     Call,
@@ -61,12 +60,13 @@ class Diffusion(NetworkFlow):
     def __init__(
         self,
         space: ModelSpace,
-        backbone: Mapping[str, Any],
+        backbone: Options,
         prediction: str = "eps",
-        schedule: Mapping[str, Any] | None = None,
+        schedule: Options | None = None,
         clip: Positive | None = 1.0,
     ) -> None:
         super().__init__(space, backbone)
+        self.backbone.refuse_parametrised(type(self).__name__)
         self.prediction = PREDICTIONS[prediction]
         self.clip = clip
         self.answer = f"{prediction}(z, log-SNR)"
@@ -83,9 +83,9 @@ class Diffusion(NetworkFlow):
     def denoise(self, z: Tensor, log_snr: Tensor) -> Tensor:
         """Expected data given z, clamped."""
         x, _ = self.prediction.split(z, self.predict(z, log_snr), log_snr)
-        return self.clipped(x) + 0 * x  # keeps NaN
+        return self._clipped(x) + 0 * x  # keeps NaN
 
-    def clipped(self, x: Tensor) -> Tensor:
+    def _clipped(self, x: Tensor) -> Tensor:
         return x if self.clip is None else x.clamp(-self.clip, self.clip)
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
@@ -119,7 +119,7 @@ class Diffusion(NetworkFlow):
 
         log_snrs = self.log_snrs(how, z)
         *_, z = repaint(denoise, z, image, known, log_snrs, noise, how.repeats, how.jump)
-        return self.clipped(z)
+        return self._clipped(z)
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class DDIM(OnGrid):
     ) -> Generated:
         log_snrs = generator.log_snrs(self, noise)
         z = last_of(walk(generator.denoise, noise, log_snrs, self.eta, draws), progress)
-        return Generated.after(generator.clipped(z), self.steps, finite(z))
+        return Generated.after(generator._clipped(z), self.steps, finite(z))
 
 
 @dataclass(frozen=True)

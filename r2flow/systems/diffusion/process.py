@@ -13,6 +13,7 @@ Noise is passed as a tensor or function, so that samplers are deterministic func
 
 from collections.abc import Callable, Iterator
 from itertools import count, pairwise
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -32,17 +33,15 @@ def for_images(log_snr: Tensor, z: Tensor) -> Tensor:
     return expand_time(log_snr.to(z), z)
 
 
-class Prediction:
+class _Prediction(NamedTuple):
     """A prediction y = p x + q eps, which with z = alpha x + sigma eps determines x and eps.
 
         x = (sigma y - q z) / d,    eps = (p z - alpha y) / d,    d = p sigma - q alpha
 
-    Its error is |p - q alpha / sigma| times that of x. `coefficients` are p and q from alpha and
-    sigma.
+    Its error is |p - q alpha / sigma| times that of x.
     """
 
-    def __init__(self, coefficients: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]) -> None:
-        self.coefficients = coefficients
+    coefficients: Callable[[Tensor, Tensor], tuple[Any, Any]]  # p and q from alpha and sigma
 
     def target(self, x: Tensor, eps: Tensor, log_snr: Tensor) -> Tensor:
         """y of data and noise, (B, ...), at log-SNRs () or (B,)."""
@@ -72,9 +71,9 @@ class Prediction:
 
 PREDICTIONS = Registry(
     "prediction",
-    eps=Prediction(lambda alpha, sigma: (torch.zeros_like(alpha), torch.ones_like(alpha))),
-    v=Prediction(lambda alpha, sigma: (-sigma, alpha)),  # Salimans and Ho 2022, appendix D
-    x=Prediction(lambda alpha, sigma: (torch.ones_like(alpha), torch.zeros_like(alpha))),
+    eps=_Prediction(lambda alpha, sigma: (0.0, 1.0)),
+    v=_Prediction(lambda alpha, sigma: (-sigma, alpha)),  # Salimans and Ho 2022, appendix D
+    x=_Prediction(lambda alpha, sigma: (1.0, 0.0)),
 )
 
 # Expected data given (z, log-SNR), the latter of shape ()
@@ -113,7 +112,7 @@ def step(
     return z_s if noise is None else z_s + next_sigma * eta * c.sqrt() * noise
 
 
-def forward_step(z: Tensor, log_snr: Tensor, next_log_snr: Tensor, noise: Tensor) -> Tensor:
+def _forward_step(z: Tensor, log_snr: Tensor, next_log_snr: Tensor, noise: Tensor) -> Tensor:
     """z_t from z_s, s < t: alpha_t / alpha_s z_s + sigma_t sqrt(1 - e^(lambda_t - lambda_s)) n."""
     lambda_s = for_images(log_snr, z)
     lambda_t = for_images(next_log_snr, z)
@@ -174,7 +173,7 @@ def repaint(
         for repeat in range(1 if last else repeats):
             if repeat:
                 for start, end in pairwise(levels.flip(0)):
-                    z = forward_step(z, start, end, noise(next(j)))
+                    z = _forward_step(z, start, end, noise(next(j)))
             for start, end in pairwise(levels):
                 measured = noised(image, end, noise(next(j)))
                 z = step(z, denoise(z, start), start, end, 1.0, noise(next(j)))

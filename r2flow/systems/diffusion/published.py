@@ -3,13 +3,13 @@
 A dict of cfg, weights, ema_weights, optimizer, lr_scheduler and global_step.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from r2flow.errors import InputError
 from r2flow.model.published import BACKBONE, Format, Published, has_keys, rings_of
 from r2flow.model.published import published_config as flow_config
+from r2flow.registry import Options
 
 _RANGES = {"log_depth": "logscale", "inverse_depth": "inverse", "depth": "metric"}
 _PREDICTIONS = {"eps": "eps", "v": "v", "x_0": "x"}
@@ -28,7 +28,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     return Published(config, weights, step, sampler, rings_of(config, weights))
 
 
-def published_config(cfg: Mapping[str, Any]) -> dict[str, Any]:
+def published_config(cfg: Options) -> dict[str, Any]:
     """Convert a published checkpoint's `cfg` (data, model, diffusion, training) to our config."""
     diffusion = cfg["diffusion"]
     if diffusion["timestep_type"] != "continuous" or not cfg["data"]["train_depth"]:

@@ -21,7 +21,7 @@ Beta = Annotated[float, Bound("in (0, 1)", lambda x: 0 < x < 1)]
 _FARTHEST = 20  # largest |lambda|: up to it, the float32 tangent has an error of at most 0.005
 
 
-class Cosine:
+class _Cosine:
     """lambda(t) = -2 ln tan(a + t (b - a)), a = atan e^(-highest / 2), b = atan e^(-lowest / 2).
 
     alpha_t is the cosine and sigma_t the sine of that angle (Nichol and Dhariwal 2021; Hoogeboom et
@@ -48,7 +48,7 @@ class Linear:
         return -(1e-4 + 10 * t.square()).expm1().log()
 
 
-class CosineInterpolated(Cosine):
+class _CosineInterpolated(_Cosine):
     """lambda(t) = cosine + 2 t ln(noise_d_low / image_d) + 2 (1 - t) ln(noise_d_high / image_d).
 
     More noise for larger images (Hoogeboom et al. 2023, eq. 6).
@@ -57,7 +57,7 @@ class CosineInterpolated(Cosine):
         image_d: Side of the images.
         noise_d_low: Image side with the same noise under the cosine schedule, towards t = 1.
         noise_d_high: The same towards t = 0.
-        options: Options of `Cosine`, before the shift.
+        options: Options of `_Cosine`, before the shift.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class CosineInterpolated(Cosine):
         return super().__call__(t) + t * self.low + (1 - t) * self.high
 
 
-class CosineShifted(CosineInterpolated):
+class _CosineShifted(_CosineInterpolated):
     """The same shift at all times (Hoogeboom et al. 2023, eq. 5)."""
 
     def __init__(
@@ -93,12 +93,12 @@ def square_root_linear(first: Beta = 0.0015, last: Beta = 0.0195, steps: Steps =
     return _of_steps(torch.linspace(first**0.5, last**0.5, steps, dtype=torch.float64) ** 2)
 
 
-def linear_steps(steps: Annotated[int, Bound("above 20", lambda n: n > 20)] = 1000) -> Tensor:
+def _linear_steps(steps: Annotated[int, Bound("above 20", lambda n: n > 20)] = 1000) -> Tensor:
     """lambda_t, (N,), of beta_t evenly from 0.1 / N to 20 / N (Ho et al. 2020 for N = 1,000)."""
     return _of_steps(torch.linspace(0.1 / steps, 20 / steps, steps, dtype=torch.float64))
 
 
-def cosine_steps(steps: Steps = 1000, offset: NonNegative = 0.008) -> Tensor:
+def _cosine_steps(steps: Steps = 1000, offset: NonNegative = 0.008) -> Tensor:
     """lambda_t, (N,), of alpha_t ~ cos(pi / 2 (t / N + offset) / (1 + offset)).
 
     Nichol and Dhariwal 2021, eq. 17.
@@ -107,7 +107,7 @@ def cosine_steps(steps: Steps = 1000, offset: NonNegative = 0.008) -> Tensor:
     return _of_signal(torch.cos((t + offset) / (1 + offset) * math.pi / 2).square())
 
 
-def sigmoid_steps(steps: Steps = 1000, start: float = -3.0, end: float = 3.0) -> Tensor:
+def _sigmoid_steps(steps: Steps = 1000, start: float = -3.0, end: float = 3.0) -> Tensor:
     """lambda_t, (N,), of alpha_t^2 ~ sigmoid(end) - sigmoid(start + (end - start) t / N), 1 at t =
     0.
 
@@ -125,15 +125,15 @@ def _of_signal(alpha_squared: Tensor) -> Tensor:
 
 SCHEDULES = Registry(
     "log-SNR schedule",
-    cosine=Cosine,
+    cosine=_Cosine,
     linear=Linear,
-    cosine_shifted=CosineShifted,
-    cosine_interpolated=CosineInterpolated,
+    cosine_shifted=_CosineShifted,
+    cosine_interpolated=_CosineInterpolated,
 )
 DISCRETE = Registry(
     "schedule of steps",
     square_root_linear=square_root_linear,
-    linear=linear_steps,
-    cosine=cosine_steps,
-    sigmoid=sigmoid_steps,
+    linear=_linear_steps,
+    cosine=_cosine_steps,
+    sigmoid=_sigmoid_steps,
 )

@@ -6,8 +6,8 @@ and generated. p adapts to the discriminator's scores of real images.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from r2flow.backbones.layers import at_least_float32
 from r2flow.noise import generator
 from r2flow.processes import sum_over_processes
-from r2flow.registry import Natural, NonNegative, Portion, Registry
+from r2flow.registry import Natural, NonNegative, Portion
 
 # Low-pass filter of the wavelet sym6 (Daubechies 1992), for up- and downsampling.
 _SYM6 = (
@@ -34,25 +34,26 @@ class BatchDraws:
 
     def uniform(self, *shape: int) -> Tensor:
         """Uniform in [0, 1), (B, *shape), on the CPU."""
-        draws = [torch.from_numpy(rng.random(shape, dtype="float32")) for rng in self.streams]
-        return torch.stack(draws)
+        return torch.tensor(np.stack([rng.random(shape, "float32") for rng in self.streams]))
 
     def normal(self, *shape: int) -> Tensor:
         """Standard normal, (B, *shape), on the CPU."""
-        draws = [rng.standard_normal(shape, dtype="float32") for rng in self.streams]
-        return torch.stack([torch.from_numpy(draw) for draw in draws])
+        draws = [rng.standard_normal(shape, "float32") for rng in self.streams]
+        return torch.tensor(np.stack(draws))
 
 
-Draw = tuple[Tensor, Tensor]
-"""A batch's magnitudes, (B,) or (2, B) for rows and columns, and whether they apply, (B,) 0/1."""
+Draws = Mapping[str, tuple[Tensor, Tensor]]
+"""By name: magnitudes, (B,) or (2, B) for rows and columns, and whether they apply, (B,) 0/1."""
 
 
 def _flip(source: BatchDraws) -> Tensor:
     return (source.uniform() < 0.5).float()
 
 
+_Magnitudes = dict[str, Callable[[BatchDraws], Tensor]]
+
 # Magnitudes for a batch, in the order of drawing and application.
-GEOMETRY: dict[str, Callable[[BatchDraws], Tensor]] = {
+GEOMETRY: _Magnitudes = {
     "lr_flip": _flip,
     "ud_flip": _flip,
     "int_trans": lambda source: (source.uniform(2).mT - 0.5) / 4,  # relative to the size
@@ -60,12 +61,12 @@ GEOMETRY: dict[str, Callable[[BatchDraws], Tensor]] = {
     "frac_trans": lambda source: 0.125 * source.normal(2).mT,
 }
 # The published hue and saturation do not affect images of one or two channels.
-COLOUR: dict[str, Callable[[BatchDraws], Tensor]] = {
+COLOUR: _Magnitudes = {
     "brightness": lambda source: 0.2 * source.normal(),
     "contrast": lambda source: torch.exp2(0.5 * source.normal()),
     "luma_flip": _flip,
 }
-TRANSFORMATIONS = Registry("augmentation", **GEOMETRY, **COLOUR)
+TRANSFORMATIONS = GEOMETRY | COLOUR
 
 
 class AdaptiveAugment(nn.Module):
@@ -80,7 +81,6 @@ class AdaptiveAugment(nn.Module):
         initial: Initial p.
         highest: Maximum p.
         every: Steps between updates of p.
-        policy: Factor on p for each transformation in `TRANSFORMATIONS`; default 1; 0: disabled.
     """
 
     def __init__(
@@ -90,16 +90,12 @@ class AdaptiveAugment(nn.Module):
         initial: Portion = 0.0,
         highest: Portion = 0.9,
         every: Natural = 4,
-        policy: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
         self.target = target
         self.images = 1000 * kimg
         self.highest = highest
         self.every = every
-        self.policy = policy or {}
-        for name in self.policy:
-            TRANSFORMATIONS[name]
         # Named as in published checkpoints.
         self.p = nn.Buffer(torch.tensor(float(initial)))
         self.sign_cum = nn.Buffer(torch.zeros(1))
@@ -120,29 +116,29 @@ class AdaptiveAugment(nn.Module):
         self.n_pred_cum.zero_()
         return sign
 
-    def draw(self, source: BatchDraws) -> dict[str, Draw]:
+    def draw(self, source: BatchDraws) -> Draws:
         """Draw a batch's transformations by name; the number of draws does not depend on p."""
         draws = {}
         p = float(self.p)
         for name, magnitudes in TRANSFORMATIONS.items():
             value = magnitudes(source)
-            draws[name] = (value, (source.uniform() < p * self.policy.get(name, 1)).float())
+            draws[name] = (value, (source.uniform() < p).float())
         return draws
 
-    def forward(self, x: Tensor, draws: Mapping[str, Draw]) -> Tensor:
+    def forward(self, x: Tensor, draws: Draws) -> Tensor:
         """Transform x (B, C, H, W) in at least float32; twice differentiable."""
         with torch.autocast(x.device.type, enabled=False):
             maps = (part.to(x.device) for part in affine(draws, *x.shape[2:]))
-            return coloured(transformed(at_least_float32(x), *maps), draws)
+            return _coloured(transformed(at_least_float32(x), *maps), draws)
 
 
-def _applied(draws: Mapping[str, Draw], name: str, identity: float) -> Tensor:
+def _applied(draws: Draws, name: str, identity: float) -> Tensor:
     """Magnitudes of a transformation, and that of the identity where it does not apply."""
     value, chosen = draws[name]
     return torch.where(chosen > 0, value, identity)
 
 
-def affine(draws: Mapping[str, Draw], height: int, width: int) -> tuple[Tensor, Tensor]:
+def affine(draws: Draws, height: int, width: int) -> tuple[Tensor, Tensor]:
     """Scale and shift of pixels about the image centre by all of `GEOMETRY`, (2, B) each.
 
     Rows are before columns. Only rows are scaled, since a scale of columns would open the ring.
@@ -197,7 +193,7 @@ def _row(lines: Tensor, index: Tensor) -> Tensor:
     return lines[nearest] * (index == nearest)[..., None].to(lines)
 
 
-def coloured(x: Tensor, draws: Mapping[str, Draw]) -> Tensor:
+def _coloured(x: Tensor, draws: Draws) -> Tensor:
     """Apply all of `COLOUR` to x of one channel; two are left alone, as in the published code."""
     if x.shape[1] != 1:
         return x

@@ -3,15 +3,13 @@
 Nakashima and Kurazume 2021, as the baselines in the code of DUSty v2.
 """
 
-from collections.abc import Mapping
 from itertools import pairwise
-from typing import Any
 
 from torch import nn
 
 from r2flow.backbones.layers import halved
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.registry import Count, Positive
+from r2flow.registry import Count, Options, Positive
 from r2flow.systems.gan.generator import Gan
 from r2flow.systems.gan.layers import (
     IMAGE,
@@ -43,6 +41,7 @@ class VanillaGan(Gan):
         base_channels: Width of the outermost map; it doubles inwards.
         doublings: From the first map to the image; 4 as published.
         tanh: Whether the image ends in tanh; the published weights of v2 alone do.
+        temperature: Temperature of the relaxed mask of `DustyV1`.
     """
 
     drops = False
@@ -50,12 +49,13 @@ class VanillaGan(Gan):
     def __init__(
         self,
         space: ModelSpace,
-        backbone: Mapping[str, Any] | None = None,
+        backbone: Options | None = None,
         latent: Count = 512,
         base_channels: Count = 64,
         max_channels: Count = 512,
         doublings: Count = 4,
         tanh: bool = False,
+        temperature: Positive = 1.0,
     ) -> None:
         channels, *shape = space.shape
         first = halved("this GAN", shape, doublings, least=2)
@@ -72,29 +72,15 @@ class VanillaGan(Gan):
         if self.drops:
             heads[LOGIT] = _doubling(widths[-1], 1, bias=True)
         synthesis.append(Heads(heads))
-        mask = RayDrop() if self.drops else None
+        mask = RayDrop(temperature) if self.drops else None
         network = LatentGenerator(latent, latent, nn.Identity(), synthesis, mask, tanh)
         super().__init__(space, network)
 
 
 class DustyV1(VanillaGan):
-    """`VanillaGan` with a second output, the logits of a mask of returns.
-
-    Args:
-        temperature: Temperature of the relaxed mask.
-    """
+    """`VanillaGan` with a second output, the logits of a mask of returns."""
 
     drops = True
-
-    def __init__(
-        self,
-        space: ModelSpace,
-        backbone: Mapping[str, Any] | None = None,
-        temperature: Positive = 1.0,
-        **options: Any,
-    ) -> None:
-        super().__init__(space, backbone, **options)
-        self.network.temperature = temperature
 
 
 class Discriminator(nn.Sequential):

@@ -12,7 +12,7 @@ from r2flow.lidar.encoding import ModelSpace
 from r2flow.noise import Draws
 from r2flow.registry import Bound
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler
-from r2flow.systems.gan.layers import LatentGenerator
+from r2flow.systems.gan.layers import LatentGenerator, Outputs
 
 
 class Gan(Generator):
@@ -33,7 +33,7 @@ class Gan(Generator):
         self.network = network
         self.register_buffer("angle", None)
 
-    def made(self, z: Tensor, uniform: Tensor | None = None, **options: Any) -> dict[str, Tensor]:
+    def made(self, z: Tensor, uniform: Tensor | None = None, **options: Any) -> Outputs:
         """Outputs of the network, see `LatentGenerator`."""
         return self.network(z, self.angle, uniform=uniform, **options)
 

@@ -12,7 +12,7 @@ from r2flow.backbones.layers import ExactBuffers, at_least_float32, uncast, wrap
 from r2flow.processes import mean_over_processes
 
 DROPPED = -1.0  # value of a dropped ray in model space
-# Outputs of a network.
+Outputs = dict[str, Tensor]  # of a network, by name
 IMAGE = "image"
 LOGIT = "raydrop_logit"
 
@@ -112,7 +112,7 @@ class Heads(nn.Module):
         super().__init__()
         self.heads = nn.ModuleDict(heads)
 
-    def forward(self, *inputs: Tensor) -> dict[str, Tensor]:
+    def forward(self, *inputs: Tensor) -> Outputs:
         return {name: at_least_float32(head(*inputs)) for name, head in self.heads.items()}
 
 
@@ -121,7 +121,7 @@ def logistic(uniform: Tensor) -> Tensor:
     return torch.logit(uniform, torch.finfo(torch.float32).eps)
 
 
-def straight_through_mask(logit: Tensor, noise: Tensor, temperature: float = 1.0) -> Tensor:
+def _straight_through_mask(logit: Tensor, noise: Tensor, temperature: float = 1.0) -> Tensor:
     """m ~ Bernoulli(sigmoid(logit)), 0 or 1, with the gradient of its relaxation s.
 
     s = sigmoid((logit + noise) / temperature) and m = [s > 1/2] for `logistic` noise (Maddison et
@@ -134,15 +134,14 @@ def straight_through_mask(logit: Tensor, noise: Tensor, temperature: float = 1.0
 class RayDrop(nn.Module):
     """Set rays dropped by a random mask to -1 (Nakashima and Kurazume 2021, section III-B)."""
 
-    def __init__(self) -> None:
+    def __init__(self, temperature: float) -> None:
         super().__init__()
+        self.temperature = temperature
         self.raydrop_const = nn.Buffer(torch.tensor(DROPPED))
 
-    def forward(
-        self, made: dict[str, Tensor], uniform: Tensor, temperature: float
-    ) -> dict[str, Tensor]:
+    def forward(self, made: Outputs, uniform: Tensor) -> Outputs:
         image = made[IMAGE]
-        mask = straight_through_mask(made[LOGIT], logistic(uniform), temperature)
+        mask = _straight_through_mask(made[LOGIT], logistic(uniform), self.temperature)
         dropped = image.lerp(self.raydrop_const, 1 - mask)
         return {**made, "image_orig": image, "raydrop_mask": mask, IMAGE: dropped}
 
@@ -161,7 +160,6 @@ class LatentGenerator(nn.Module):
     """
 
     decay = 0.995  # of the average w_avg
-    temperature = 1.0  # of the relaxed mask
 
     def __init__(
         self,
@@ -190,7 +188,7 @@ class LatentGenerator(nn.Module):
         truncation: float = 1.0,
         uniform: Tensor | None = None,
         shift: Tensor | None = None,
-    ) -> dict[str, Tensor]:
+    ) -> Outputs:
         """Generate `image` (B, C, H, W) and `w` (B, layers, code) from normal z.
 
         With a mask, there are also `image_orig`, `raydrop_logit` and `raydrop_mask`. In training
@@ -204,18 +202,18 @@ class LatentGenerator(nn.Module):
             uniform: u in [0, 1) for the noise of the mask, (B, 1, H, W).
             shift: Azimuth rotation of each scan in full turns, (B,), for a synthesis with angles.
         """
-        w: Tensor = self.mapping_network(z)
+        w = self.mapping_network(z)
         if self.training:
             mean = mean_over_processes(w.detach().mean(0, keepdim=True))
             self.w_avg.lerp_(mean.to(self.w_avg), 1 - self.decay)
         elif truncation != 1:
             w = self.w_avg.lerp(w, truncation)
         rays = () if angle is None else (angle, shift)
-        made: dict[str, Tensor] = self.synthesis_network(w, *rays)
+        made = self.synthesis_network(w, *rays)
         if self.tanh:
             made[IMAGE] = made[IMAGE].tanh()
         made["w"] = w[:, None].expand(-1, self.num_styles, -1)
         if self.measurement_model is not None:
             assert uniform is not None
-            made = self.measurement_model(made, uniform, self.temperature)
+            made = self.measurement_model(made, uniform)
         return made

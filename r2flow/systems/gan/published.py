@@ -3,11 +3,11 @@
 They have the entries cfg, step, angle, G, G_ema, D, ...
 """
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from r2flow.model.published import Format, Published, has_keys, sensor_of
+from r2flow.registry import Options
 from r2flow.systems.gan.layers import DROPPED
 
 GENERATORS = {"vanilla": "vanilla_gan", "dusty_v1": "dusty1", "dusty_v2": "dusty2"}
@@ -54,11 +54,11 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     return Published(config, weights, step, elevations=angle[0, 0].double().mean(1))
 
 
-def _generator(model: Mapping[str, Any]) -> dict[str, Any]:
+def _generator(model: Options) -> dict[str, Any]:
     name = GENERATORS[str(model["arch"])]
     mapping = model["mapping_kwargs"]
     synthesis = model["synthesis_kwargs"]
-    options: dict[str, Any] = {
+    options = {
         "name": name,
         "latent": int(mapping["in_ch"]),
         "base_channels": int(synthesis["ch_base"]),

@@ -1,7 +1,6 @@
 """Training of GANs: losses, R1, learning rates, warm-up, and the stage."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from r2flow.registry import Count, Natural, NonNegative, Portion, Registry, construct
+from r2flow.registry import Count, Natural, NonNegative, Options, Portion, Registry, construct
 from r2flow.stages.base import Batch, Stage
 from r2flow.systems.gan import dcgan, style_discriminator
 from r2flow.systems.gan.augment import AdaptiveAugment, BatchDraws
@@ -17,12 +16,12 @@ from r2flow.systems.gan.generator import Gan
 from r2flow.systems.gan.layers import DROPPED, Filter
 
 
-def generator_loss(fake: Tensor) -> Tensor:
+def _generator_loss(fake: Tensor) -> Tensor:
     """mean softplus(-D(G(z))) (Goodfellow et al. 2014, section 3, the non-saturating form)."""
     return softplus(-fake).mean()
 
 
-def discriminator_loss(real: Tensor, fake: Tensor) -> Tensor:
+def _discriminator_loss(real: Tensor, fake: Tensor) -> Tensor:
     """mean softplus(-D(x)) + mean softplus(D(G(z))) (Goodfellow et al. 2014, eq. 1, as a loss)."""
     return softplus(-real).mean() + softplus(fake).mean()
 
@@ -37,7 +36,7 @@ def r1(scores: Tensor, x: Tensor) -> Tensor:
     return gradient.square().flatten(1).sum(1).mean()
 
 
-def lazy_adam(
+def _lazy_adam(
     learning_rate: float, betas: tuple[float, float], every: int
 ) -> tuple[float, tuple[float, float]]:
     """Adam's learning rate and betas with an additional penalty step every `every` steps.
@@ -67,13 +66,13 @@ class Warmup:
         `uniform` has each value's draw in [0, 1); None is enough once the warm-up is over.
         """
         left = self.left(images)
-        x = blurred(x, self.blur * left)
+        x = _blurred(x, self.blur * left)
         if uniform is None:
             return x
         return torch.where(uniform < 1 - self.dropout * left, x, DROPPED)
 
 
-def blurred(x: Tensor, sigma: float) -> Tensor:
+def _blurred(x: Tensor, sigma: float) -> Tensor:
     """x filtered by 2^(-(k / sigma)^2), |k| <= floor(3 sigma), over its sum.
 
     Circular in azimuth, the edge rows repeated (Karras et al. 2021, StyleGAN3).
@@ -102,7 +101,7 @@ class LearnGan(Stage):
     steps.
 
     All that D sees is warmed up (`Warmup`) and augmented (`AdaptiveAugment`). Both learn by Adam at
-    a constant rate (`lazy_adam` for D). The loss is the non-saturating one; R1's weight is r1
+    a constant rate (`_lazy_adam` for D). The loss is the non-saturating one; R1's weight is r1
     r1_every / 2, which makes up for the steps without it. The recipe is DUSty v2's. The log has the
     probability of augmentation after each step (`train/augmented`) and R1 when it was last measured
     (`train/last_r1`).
@@ -123,12 +122,12 @@ class LearnGan(Stage):
     def __init__(
         self,
         *model: Any,
-        discriminator: Mapping[str, Any] | None = None,
+        discriminator: Options | None = None,
         betas: tuple[Portion, Portion] = (0.0, 0.99),
         r1: NonNegative = 1.0,
         r1_every: Count = 16,
-        warmup: Mapping[str, Any] | None = None,
-        augment: Mapping[str, Any] | None = None,
+        warmup: Options | None = None,
+        augment: Options | None = None,
         **options: Any,
     ) -> None:
         super().__init__(*model, betas=betas, **{"warmup_images": 0, **options})
@@ -147,7 +146,7 @@ class LearnGan(Stage):
     def configure_optimizers(self) -> Any:
         learning_rate = self.hparams["learning_rate"]
         betas = tuple(self.hparams["betas"])
-        lazy = lazy_adam(learning_rate, betas, self.r1_every if self.r1 else 0)
+        lazy = _lazy_adam(learning_rate, betas, self.r1_every if self.r1 else 0)
         return [
             torch.optim.Adam(self.generator.parameters(), learning_rate, betas),
             torch.optim.Adam(self.discriminator.parameters(), *lazy),
@@ -161,22 +160,22 @@ class LearnGan(Stage):
 
         draws = BatchDraws(self.hparams["seed"], batch, GENERATOR)
         self.discriminator.requires_grad_(False)
-        shown = self.shown(self.make(batch["x_0"], draws), images, draws)
-        loss = generator_loss(self.discriminator(shown))
+        shown = self._shown(self._make(batch["x_0"], draws), images, draws)
+        loss = _generator_loss(self.discriminator(shown))
         self.take_step(for_generator, loss)
         self.discriminator.requires_grad_(True)
 
         draws = BatchDraws(self.hparams["seed"], batch, FAKE)
         with torch.no_grad():
             z = draws.normal(*self.generator.noise_shape).to(real.device)
-            fake = self.shown(self.make(z, draws), images, draws)
-            seen = self.shown(real, images, BatchDraws(self.hparams["seed"], batch, REAL))
+            fake = self._shown(self._make(z, draws), images, draws)
+            seen = self._shown(real, images, BatchDraws(self.hparams["seed"], batch, REAL))
         of_real = self.discriminator(seen)
-        wrong = discriminator_loss(of_real, self.discriminator(fake))
+        wrong = _discriminator_loss(of_real, self.discriminator(fake))
         self.take_step(for_discriminator, wrong)
 
         if self.r1 and step % self.r1_every == 0:
-            penalty = self.penalty(real, images, BatchDraws(self.hparams["seed"], batch, PENALTY))
+            penalty = self._penalty(real, images, BatchDraws(self.hparams["seed"], batch, PENALTY))
             self.take_step(for_discriminator, self.r1 * self.r1_every / 2 * penalty)
             self.last_r1 = penalty.detach()
         if self.last_r1 is not None:
@@ -189,14 +188,14 @@ class LearnGan(Stage):
         self.log("train/loss", loss, prog_bar=True, sync_dist=True)
         self.log("train/discriminator", wrong, prog_bar=True, sync_dist=True)
 
-    def make(self, z: Tensor, draws: BatchDraws) -> Tensor:
+    def _make(self, z: Tensor, draws: BatchDraws) -> Tensor:
         """G(z), (B, C, H, W), with random mask and rotation."""
         gan = self.generator
         uniform = draws.uniform(1, *gan.space.shape[1:]).to(z.device) if gan.drops else None
         shift = None if gan.angle is None else draws.uniform().to(z.device)
         return gan.made(z, uniform, shift=shift)["image"]
 
-    def shown(self, x: Tensor, images: int, draws: BatchDraws) -> Tensor:
+    def _shown(self, x: Tensor, images: int, draws: BatchDraws) -> Tensor:
         """Input x of D after a number of images of the run."""
         uniform = None
         if self.warmup.left(images):
@@ -204,8 +203,8 @@ class LearnGan(Stage):
         x = self.warmup(x, images, uniform)
         return x if self.augment is None else self.augment(x, self.augment.draw(draws))
 
-    def penalty(self, real: Tensor, images: int, draws: BatchDraws) -> Tensor:
+    def _penalty(self, real: Tensor, images: int, draws: BatchDraws) -> Tensor:
         """R1 with gradients by the scans, through warm-up and augmentation, in float32."""
         with torch.autocast(real.device.type, enabled=False):
             x = real.detach().requires_grad_()
-            return r1(self.discriminator(self.shown(x, images, draws)), x)
+            return r1(self.discriminator(self._shown(x, images, draws)), x)

@@ -5,9 +5,8 @@ of 3D LiDAR data".
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +16,7 @@ from r2flow.backbones.layers import ExactBuffers, at_least_float32, halved
 from r2flow.generators.base import Generator
 from r2flow.lidar.encoding import ModelSpace
 from r2flow.processes import mean_over_processes
-from r2flow.registry import Count, Positive
+from r2flow.registry import Count, Options, Positive
 from r2flow.systems.gan.generator import Gan
 from r2flow.systems.gan.layers import (
     IMAGE,
@@ -26,6 +25,7 @@ from r2flow.systems.gan.layers import (
     Equalised,
     Heads,
     LatentGenerator,
+    Outputs,
     RayDrop,
 )
 
@@ -126,8 +126,8 @@ class _Level(nn.Module):
         return torch.atan2(self.downsample(angle.sin()), self.downsample(angle.cos()))
 
     def forward(
-        self, x: Tensor | None, so_far: dict[str, Tensor], w: Tensor, angle: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+        self, x: Tensor | None, so_far: Outputs, w: Tensor, angle: Tensor
+    ) -> tuple[Tensor, Outputs]:
         rays = self.pe(angle).expand(len(w), -1, -1, -1)
         if x is None:
             x = self.bias_act1(self.conv1(rays, w))
@@ -156,7 +156,7 @@ class _Synthesis(nn.Module):
             size = (shape[0] >> times, shape[1] >> times)
             self.layers.append(_Level(before, after, made, code, size))
 
-    def forward(self, w: Tensor, angle: Tensor, shift: Tensor | None) -> dict[str, Tensor]:
+    def forward(self, w: Tensor, angle: Tensor, shift: Tensor | None) -> Outputs:
         if shift is not None:
             turn = torch.stack([torch.zeros_like(shift), 2 * math.pi * shift], 1)
             angle = angle + turn[:, :, None, None]
@@ -164,15 +164,15 @@ class _Synthesis(nn.Module):
         for level in self.layers[:0:-1]:
             angles.append(level.coarser(angles[-1]))  # type: ignore[operator]
         x: Tensor | None = None
-        made: dict[str, Tensor] = {}
+        made: Outputs = {}
         for level in self.layers:
             x, made = level(x, made, w, angles.pop())
         if shift is not None:
-            made = {name: turned_back(o, shift) for name, o in made.items()}
+            made = {name: _turned_back(o, shift) for name, o in made.items()}
         return {name: o / 4 for name, o in made.items()}
 
 
-def turned_back(x: Tensor, shift: Tensor) -> Tensor:
+def _turned_back(x: Tensor, shift: Tensor) -> Tensor:
     """Rotate x (B, C, H, W) left by `shift` turns, (B,), with linear interpolation of columns."""
     width = x.shape[-1]
     place = torch.arange(width, device=x.device) + shift.double()[:, None] * width
@@ -199,7 +199,7 @@ class DustyV2(Gan):
     def __init__(
         self,
         space: ModelSpace,
-        backbone: Mapping[str, Any] | None = None,
+        backbone: Options | None = None,
         latent: Count = 512,
         code: Count | None = None,
         depth: Count = 2,
@@ -223,8 +223,9 @@ class DustyV2(Gan):
         widths = [min(base_channels << i, max_channels) for i in reversed(range(doublings + 1))]
         synthesis = _Synthesis(shape, {IMAGE: channels, LOGIT: 1}, code, widths)
         styles = 2 * len(widths)
-        network = LatentGenerator(latent, code, mapping, synthesis, RayDrop(), tanh, styles)
-        network.temperature = temperature
+        network = LatentGenerator(
+            latent, code, mapping, synthesis, RayDrop(temperature), tanh, styles
+        )
         super().__init__(space, network)
         self.angle = space.rays[None].clone()
 

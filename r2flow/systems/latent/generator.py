@@ -1,6 +1,5 @@
 """Latent-space generators: LiDM's autoencoder, and the diffusion of its latents."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -10,7 +9,7 @@ from torch import Tensor, nn
 from r2flow.errors import InputError
 from r2flow.generators.base import Generator
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.registry import Count, construct
+from r2flow.registry import Count, Options, construct
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
 from r2flow.systems.diffusion.generator import DDIM, Share
 from r2flow.systems.diffusion.process import PREDICTIONS, walk
@@ -19,7 +18,18 @@ from r2flow.systems.latent.autoencoder import Autoencoder
 from r2flow.systems.latent.unet import LatentUNet
 
 
-class VQAutoencoder(Generator):
+class _Latent(Generator):
+    """A generator with an autoencoder, whose noise has the shape of the latents."""
+
+    def __init__(self, space: ModelSpace, autoencoder: Options | None) -> None:
+        super().__init__(space)
+        self.first_stage_model = construct(
+            "generator.autoencoder", Autoencoder, autoencoder, space.shape[0]
+        )
+        self.noise_shape = self.first_stage_model.latent_shape(*space.shape[1:])
+
+
+class VQAutoencoder(_Latent):
     """An autoencoder, the first stage of a `LatentDiffusion`. It cannot sample scans from noise.
 
     Args:
@@ -29,21 +39,12 @@ class VQAutoencoder(Generator):
     unconditional = False
 
     def __init__(
-        self,
-        space: ModelSpace,
-        backbone: Mapping[str, Any],
-        autoencoder: Mapping[str, Any] | None = None,
+        self, space: ModelSpace, backbone: Options | None, autoencoder: Options | None = None
     ) -> None:
-        super().__init__(space)
-        self.first_stage_model = _autoencoder(space, autoencoder)
-        self.noise_shape = self.first_stage_model.latent_shape(*space.shape[1:])
+        super().__init__(space, autoencoder)
 
 
-def _autoencoder(space: ModelSpace, options: Mapping[str, Any] | None) -> Autoencoder:
-    return construct("generator.autoencoder", Autoencoder, options, space.shape[0])
-
-
-class LatentDiffusion(Generator):
+class LatentDiffusion(_Latent):
     """eps(z_t, t) by a U-Net on an autoencoder's latents, sampled by DDIM and decoded.
 
     LiDM (Ran et al. 2024). Latents become codes when they are decoded, not before. Its sampler is
@@ -60,15 +61,13 @@ class LatentDiffusion(Generator):
     def __init__(
         self,
         space: ModelSpace,
-        backbone: Mapping[str, Any],
-        autoencoder: Mapping[str, Any] | None = None,
-        unet: Mapping[str, Any] | None = None,
-        schedule: Mapping[str, Any] | None = None,
+        backbone: Options | None,
+        autoencoder: Options | None = None,
+        unet: Options | None = None,
+        schedule: Options | None = None,
     ) -> None:
-        super().__init__(space)
+        super().__init__(space, autoencoder)
         self.run_by(LatentDDIM())
-        self.first_stage_model = _autoencoder(space, autoencoder)
-        self.noise_shape = self.first_stage_model.latent_shape(*space.shape[1:])
         with torch.device("cpu"):
             log_snr = DISCRETE.build(schedule or {"name": "square_root_linear"})
         network = construct("generator.unet", LatentUNet, unet, self.noise_shape)
@@ -107,7 +106,7 @@ class LatentDDIM(Sampler):
     eta: Share = 1.0  # share of fresh noise
 
     def evaluations(self, generator: Any) -> int:
-        return len(some_of(len(generator.log_snr), self.steps))
+        return len(_some_of(len(generator.log_snr), self.steps))
 
     def check(self, generator: Any) -> None:
         super().check(generator)
@@ -116,7 +115,7 @@ class LatentDDIM(Sampler):
     def __call__(
         self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
     ) -> Generated:
-        times = some_of(len(generator.log_snr), self.steps)
+        times = _some_of(len(generator.log_snr), self.steps)
         log_snrs = generator.log_snr[[*times.tolist(), 0]]
         z = last_of(walk(generator.expected, noise, log_snrs, self.eta, draws, times), progress)
         # Its output is the scan, without later corrections.
@@ -125,7 +124,7 @@ class LatentDDIM(Sampler):
         return Generated.after(scans, len(times))
 
 
-def some_of(total: int, steps: int) -> Tensor:
+def _some_of(total: int, steps: int) -> Tensor:
     """Every (total // steps)-th number below total from 1, decreasing.
 
     There are more than `steps` if it does not divide the total.

@@ -19,6 +19,7 @@ from r2flow.files import reading_errors
 from r2flow.lidar.encoding import ShiftedLog
 from r2flow.lidar.sensors import build_sensor
 from r2flow.model.published import Format, Published
+from r2flow.registry import Config, Options
 from r2flow.systems.latent.autoencoder import UP
 
 log = logging.getLogger(__name__)
@@ -41,7 +42,7 @@ _FORM = {
     "scale_factor": 1.0,
     "scale_by_std": False,
 }
-_IMAGES: dict[str, Any] = {
+_IMAGES: Config = {
     "size": [64, 1024],
     "depth_range": [1.0, 56.0],
     "log_scale": True,
@@ -58,15 +59,15 @@ def _state(content: Any, averaged: bool = False) -> dict[str, Tensor]:
     return weights
 
 
-def holds_diffusion(content: Any) -> bool:
+def _holds_diffusion(content: Any) -> bool:
     return {_UNET + "time_embed.0.weight", _AUTOENCODER + _FIRST} <= _state(content).keys()
 
 
-def holds_autoencoder(content: Any) -> bool:
+def _holds_autoencoder(content: Any) -> bool:
     return {_FIRST, _CODES} <= _state(content).keys()
 
 
-def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published:
+def _read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published:
     """Read a published latent diffusion."""
     state = _state(content, averaged)
     if _within(state, "cond_stage_model."):
@@ -85,7 +86,7 @@ def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published
             f"{path}: the square roots of its betas are not evenly spaced, as LiDM's are."
         )
     first, last = betas[[0, -1]].numpy()
-    generator: dict[str, Any] = {
+    generator: Config = {
         "name": "latent_diffusion",
         "autoencoder": _autoencoder(_within(state, _AUTOENCODER)),
         "unet": _unet(_within(state, _UNET)),
@@ -101,7 +102,7 @@ def read_diffusion(content: Any, path: Path, averaged: bool = True) -> Published
     return Published(_config(generator, path, notes), weights, int(content.get("global_step", 0)))
 
 
-def read_autoencoder(content: Any, path: Path, averaged: bool = True) -> Published:
+def _read_autoencoder(content: Any, path: Path, averaged: bool = True) -> Published:
     """Read a published autoencoder, without its discriminator."""
     state = _state(content, averaged)
     generator = {"name": "vq_autoencoder", "autoencoder": _autoencoder(state)}
@@ -114,7 +115,7 @@ def read_autoencoder(content: Any, path: Path, averaged: bool = True) -> Publish
     return Published(config, weights, int(content.get("global_step", 0)))
 
 
-def _refuse_other(path: Path, form: Mapping[str, Any], options: Mapping[str, Any]) -> None:
+def _refuse_other(path: Path, form: Options, options: Options) -> None:
     other = {name: options[name] for name in form if options[name] != form[name]}
     if other:
         raise InputError(f"{path}: its config.yaml has {other}, and only LiDM's own form is read.")
@@ -130,7 +131,7 @@ def _counted(names: Mapping[str, Tensor], form: str) -> int:
     return next(number for number in count() if form.format(number) not in names)
 
 
-def _autoencoder(state: Mapping[str, Tensor]) -> dict[str, Any]:
+def _autoencoder(state: Mapping[str, Tensor]) -> Config:
     """Options of `Autoencoder` from the shapes of its weights."""
     convolution = "encoder.down.{}.block.0.conv1.weight"
     levels = range(_counted(state, convolution))
@@ -151,7 +152,7 @@ def _autoencoder(state: Mapping[str, Tensor]) -> dict[str, Any]:
     }
 
 
-def _unet(state: Mapping[str, Tensor]) -> dict[str, Any]:
+def _unet(state: Mapping[str, Tensor]) -> Config:
     """Options of `LatentUNet` from the names and shapes of its weights."""
     width = len(state["input_blocks.0.0.weight"])
     widths: list[list[int]] = [[]]  # of the residual blocks of each level
@@ -172,7 +173,7 @@ def _unet(state: Mapping[str, Tensor]) -> dict[str, Any]:
     }
 
 
-def _notes(path: Path) -> Mapping[str, Any]:
+def _notes(path: Path) -> Options:
     """Read the published `config.yaml` next to a file; empty if missing."""
     file = path.with_name("config.yaml")
     with reading_errors(file):
@@ -180,7 +181,7 @@ def _notes(path: Path) -> Mapping[str, Any]:
     return content if isinstance(content, Mapping) else {}
 
 
-def _config(generator: dict[str, Any], path: Path, notes: Mapping[str, Any]) -> dict[str, Any]:
+def _config(generator: Config, path: Path, notes: Options) -> Config:
     if not notes:
         log.warning(
             "%s has no config.yaml: assumed images of %d x %d, ranges of %g to %g m on a "
@@ -191,7 +192,7 @@ def _config(generator: dict[str, Any], path: Path, notes: Mapping[str, Any]) -> 
             _HEAD,
         )
     found = ((notes.get("data") or {}).get("params") or {}).get("dataset") or {}
-    images: dict[str, Any] = {**_IMAGES, **found}
+    images: Config = {**_IMAGES, **found}
     rows, columns = images["size"]
     nearest, farthest = map(float, images["depth_range"])
     sensor = {
@@ -223,5 +224,5 @@ def _config(generator: dict[str, Any], path: Path, notes: Mapping[str, Any]) -> 
     }
 
 
-DIFFUSION = Format("LiDM", holds_diffusion, read_diffusion)
-FIRST_STAGE = Format("LiDM's autoencoder", holds_autoencoder, read_autoencoder)
+DIFFUSION = Format("LiDM", _holds_diffusion, _read_diffusion)
+FIRST_STAGE = Format("LiDM's autoencoder", _holds_autoencoder, _read_autoencoder)

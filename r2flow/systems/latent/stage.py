@@ -1,6 +1,5 @@
 """Training of LiDM: an adversarial autoencoder, and the diffusion of its latents."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -9,13 +8,13 @@ from torch import Tensor, nn
 
 from r2flow.lidar.encoding import Encoding
 from r2flow.processes import mean_over_processes
-from r2flow.registry import Count, Natural, NonNegative, construct
+from r2flow.registry import Count, Natural, NonNegative, Options, construct
 from r2flow.stages.base import Batch, SingleLoss, Stage
 from r2flow.systems.diffusion.process import noised
 from r2flow.systems.latent.generator import LatentDiffusion, VQAutoencoder
 
 
-class PatchDiscriminator(nn.Module):
+class _PatchDiscriminator(nn.Module):
     """Map of scores of images (B, channels, H, W): 4 x 4 convolutions, batch norm and leaky ReLU.
 
     Args:
@@ -45,12 +44,12 @@ class PatchDiscriminator(nn.Module):
         return self.main(x)
 
 
-def hinge_loss(real: Tensor, fake: Tensor) -> Tensor:
+def _hinge_loss(real: Tensor, fake: Tensor) -> Tensor:
     """(mean max(0, 1 - real) + mean max(0, 1 + fake)) / 2 for scores of the discriminator."""
     return (F.relu(1 - real).mean() + F.relu(1 + fake).mean()) / 2
 
 
-def adaptive_weight(
+def _adaptive_weight(
     reconstruction: Tensor, adversarial: Tensor, last: Tensor, weight: float
 ) -> Tensor:
     """weight |grad R| / (|grad A| + 1e-4), at most 1e4 weight.
@@ -64,7 +63,7 @@ def adaptive_weight(
     return weight * ratio.clamp(0, 1e4).detach()
 
 
-def reconstruction_loss(
+def _reconstruction_loss(
     x: Tensor, made: Tensor, mask: Tensor | None = None, mask_factor: float = 0.0
 ) -> Tensor:
     """mean |x - made|; with a mask, (mean |x - made| + mask_factor mean |mask - predicted|) / 2.
@@ -78,7 +77,7 @@ def reconstruction_loss(
     return (error + mask_factor * F.l1_loss(made[:, channels:], mask)) / 2
 
 
-def adversarial_factor(step: int, start: int, inverted: bool = False) -> float:
+def _adversarial_factor(step: int, start: int, inverted: bool = False) -> float:
     """0 before step `start`, then 1; `inverted`, as in LiDM's code: 1 up to `start`, then 0."""
     return float(step <= start if inverted else step >= start)
 
@@ -96,12 +95,12 @@ class LearnAutoencoder(Stage):
     """Reconstruction, codebook and a patch discriminator: R + f w A + c Q for the autoencoder, f H
     for the latter.
 
-    R is the mean absolute error, A the discriminator's verdict, w `adaptive_weight`, Q the
-    quantiser's loss, H the hinge loss and f `adversarial_factor` (Esser et al. 2021, "Taming
+    R is the mean absolute error, A the discriminator's verdict, w `_adaptive_weight`, Q the
+    quantiser's loss, H the hinge loss and f `_adversarial_factor` (Esser et al. 2021, "Taming
     transformers").
 
     Args:
-        discriminator: Options of `PatchDiscriminator`: width and layers.
+        discriminator: Options of `_PatchDiscriminator`: width and layers.
         adversarial_weight: In w.
         adversarial_start: Step that f changes at.
         inverted: Whether f is 1 up to that step and 0 after it, as in the published code, and not
@@ -119,7 +118,7 @@ class LearnAutoencoder(Stage):
     def __init__(
         self,
         *model: Any,
-        discriminator: Mapping[str, Any] | None = None,
+        discriminator: Options | None = None,
         adversarial_weight: NonNegative = 0.6,
         adversarial_start: Natural = 1,
         inverted: bool = False,
@@ -132,7 +131,7 @@ class LearnAutoencoder(Stage):
         self.autoencoder = self.generator.first_stage_model
         channels = self.space.shape[0] + self.autoencoder.mask
         self.discriminator = construct(
-            "stage.discriminator", PatchDiscriminator, discriminator, channels
+            "stage.discriminator", _PatchDiscriminator, discriminator, channels
         )
         self.adversarial_weight = adversarial_weight
         self.codebook_weight = codebook_weight
@@ -143,35 +142,35 @@ class LearnAutoencoder(Stage):
     def configure_optimizers(self) -> Any:
         return self.optimizers_for(self.autoencoder.parameters(), self.discriminator.parameters())
 
-    def mask_of(self, x: Tensor) -> Tensor | None:
+    def _mask_of(self, x: Tensor) -> Tensor | None:
         """`returns` of images, for an autoencoder with a mask."""
         return returns(x, self.generator.space.encoding) if self.autoencoder.mask else None
 
     def training_step(self, batch: Batch, batch_idx: int) -> None:
         for_autoencoder, for_discriminator = self.own_optimizers()
         x = batch["x_1"]
-        mask = self.mask_of(x)
-        factor = adversarial_factor(self.global_step, self.adversarial_start, self.inverted)
+        mask = self._mask_of(x)
+        factor = _adversarial_factor(self.global_step, self.adversarial_start, self.inverted)
         made, codebook = self.autoencoder(x)
-        reconstruction = reconstruction_loss(x, made, mask, self.mask_factor)
+        reconstruction = _reconstruction_loss(x, made, mask, self.mask_factor)
         loss = reconstruction + self.codebook_weight * codebook
         if factor:
             adversarial = -self.discriminator(made).mean()
             last = self.autoencoder.decoder.get_parameter("conv_out.weight")
-            weight = adaptive_weight(reconstruction, adversarial, last, self.adversarial_weight)
+            weight = _adaptive_weight(reconstruction, adversarial, last, self.adversarial_weight)
             loss = loss + factor * weight * adversarial
         self.take_step(for_autoencoder, loss)
         real = x if mask is None else torch.cat([x, mask], 1)
-        judged = hinge_loss(self.discriminator(real), self.discriminator(made.detach()))
+        judged = _hinge_loss(self.discriminator(real), self.discriminator(made.detach()))
         self.take_step(for_discriminator, factor * judged)
         self.log("train/loss", reconstruction, prog_bar=True, sync_dist=True)
         self.log("train/codebook", codebook, sync_dist=True)
         self.log("train/discriminator", judged, sync_dist=True)
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+    def validation_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
         x = batch["x_1"]
         made, _ = self.autoencoder(x)
-        loss = reconstruction_loss(x, made, self.mask_of(x), self.mask_factor)
+        loss = _reconstruction_loss(x, made, self._mask_of(x), self.mask_factor)
         self.log("val/loss", loss, prog_bar=True, batch_size=len(x), sync_dist=True)
 
 

@@ -6,7 +6,7 @@ gradient by x of the log density of data plus noise of standard deviation sigma_
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -19,7 +19,7 @@ from r2flow.errors import InputError
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.base import IMAGE, KNOWN, Generator
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.registry import Count, Positive
+from r2flow.registry import Count, Options, Positive
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
 from r2flow.systems.score.refinenet import RefineNet
 
@@ -29,7 +29,7 @@ Score = Callable[[Tensor, Tensor], Tensor]
 Spacing = Literal["geometric", "uniform"]
 
 
-def noise_levels(first: float, last: float, levels: int, spacing: Spacing = "geometric") -> Tensor:
+def _noise_levels(first: float, last: float, levels: int, spacing: Spacing = "geometric") -> Tensor:
     """sigma_0 = first > ... > sigma_{L-1} = last, (levels,) float32."""
     if last > first:
         raise InputError(f"noise levels fall from {first:g} and cannot reach {last:g}.")
@@ -37,7 +37,7 @@ def noise_levels(first: float, last: float, levels: int, spacing: Spacing = "geo
     return torch.from_numpy(space(first, last, levels).astype(np.float32))
 
 
-def step_sizes(sigmas: Tensor, rate: float) -> Tensor:
+def _step_sizes(sigmas: Tensor, rate: float) -> Tensor:
     """e_i = rate (sigma_i / sigma_{L-1})^2, (L,): equal signal-to-noise ratios per step."""
     return rate * (sigmas / sigmas[-1]).square()
 
@@ -55,7 +55,7 @@ def score_loss(
     return error.square().flatten(1).sum(1) * sigmas[labels] ** power / 2
 
 
-def annealed_langevin(
+def _annealed_langevin(
     score: Score,
     x: Tensor,
     sigmas: Tensor,
@@ -67,14 +67,14 @@ def annealed_langevin(
     """Yield the states of annealed Langevin dynamics (2019, algorithm 1) after each evaluation.
 
     `steps` times at each level i, from the first to the last: x <- x + e_i s(x, i) + sqrt(2 e_i) z
-    with e_i of `step_sizes` and z = noise(k), k = 1, 2, ... counted over all levels. A last step
+    with e_i of `_step_sizes` and z = noise(k), k = 1, 2, ... counted over all levels. A last step
     removes the remaining noise (2020, section 3.3): x <- x + sigma_{L-1}^2 s(x, L-1).
 
     `pull`, the likelihood gradient as a function of the state before a step, is added in every
     step. As in LiDARGen, the last denoising adds the previous pull again, and the final state is
     pulled once more.
     """
-    sizes = step_sizes(sigmas, rate).tolist()
+    sizes = _step_sizes(sigmas, rate).tolist()
     for number in range(len(sizes) * steps):
         level = number // steps
         labels = torch.full((len(x),), level, device=x.device)
@@ -94,10 +94,10 @@ class ScoreModel(Generator):
     `steps` are per noise level. A condition pulls the scan to the known rays: densification.
 
     Args:
-        rate: Rate of `step_sizes`.
+        rate: Rate of `_step_sizes`.
         pull: Strength of the pull to known pixels per step; 1 as in the published densification.
         width: Width of the network, see `RefineNet`.
-        sigma_first, sigma_last, levels, spacing: The noise levels, see `noise_levels`.
+        sigma_first, sigma_last, levels, spacing: The noise levels, see `_noise_levels`.
     """
 
     takes_condition = True
@@ -105,7 +105,7 @@ class ScoreModel(Generator):
     def __init__(
         self,
         space: ModelSpace,
-        backbone: Mapping[str, Any],
+        backbone: Options,
         rate: Positive = 6.2e-6,
         pull: Positive = 1.0,
         width: Count = 128,
@@ -120,7 +120,7 @@ class ScoreModel(Generator):
         self.pull = pull
         channels, *shape = space.shape
         halved("RefineNet", shape, 1, least=4)
-        sigmas = noise_levels(sigma_first, sigma_last, levels, spacing)
+        sigmas = _noise_levels(sigma_first, sigma_last, levels, spacing)
         self.network = RefineNet(sigmas, channels, width)
 
 
@@ -153,6 +153,6 @@ class Langevin(Sampler):
         assert draws is not None
         network = generator.network
         rate = generator.rate
-        states = annealed_langevin(network, x, network.sigmas, draws, rate, self.steps, pull)
+        states = _annealed_langevin(network, x, network.sigmas, draws, rate, self.steps, pull)
         x = last_of(states, progress)
         return Generated.after(2 * x.clamp(0, 1) - 1, self.evaluations(generator), finite(x))

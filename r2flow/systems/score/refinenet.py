@@ -23,7 +23,7 @@ def _convolution(
     )
 
 
-class InstanceNormPlus(nn.Module):
+class _InstanceNormPlus(nn.Module):
     """gamma (instance_norm(x) + alpha m) + beta, with standardised means m of the channels.
 
     m, with the unbiased standard deviation, restores the means that the norm removes (Song and
@@ -45,7 +45,7 @@ class InstanceNormPlus(nn.Module):
         return (self.gamma[:, None, None] * normed + self.beta[:, None, None]).to(x.dtype)
 
 
-class PooledConv2d(nn.Module):
+class _PooledConv2d(nn.Module):
     """A convolution with zero padding, then 2 x 2 average pooling."""
 
     def __init__(self, channels: int, out_channels: int, size: int) -> None:
@@ -70,13 +70,13 @@ class _ScoreBlock(nn.Module):
         super().__init__()
         middle = channels if changes else out_channels
         self.conv1 = _convolution(channels, middle, dilation)
-        self.normalize2 = InstanceNormPlus(middle)
-        self.normalize1 = InstanceNormPlus(channels)
+        self.normalize2 = _InstanceNormPlus(middle)
+        self.normalize1 = _InstanceNormPlus(channels)
         self.shortcut: nn.Module = nn.Identity()
         self.conv2: nn.Module
         if changes and dilation == 1:
-            self.conv2 = PooledConv2d(channels, out_channels, 3)
-            self.shortcut = PooledConv2d(channels, out_channels, 1)
+            self.conv2 = _PooledConv2d(channels, out_channels, 3)
+            self.shortcut = _PooledConv2d(channels, out_channels, 1)
             return
         self.conv2 = _convolution(out_channels, out_channels, dilation)
         if changes:
@@ -87,7 +87,7 @@ class _ScoreBlock(nn.Module):
         return self.shortcut(x) + self.conv2(F.elu(self.normalize2(h)))
 
 
-class _ResidualUnits(nn.Module):
+class _ResidualUnits(nn.ModuleDict):
     """x <- x + conv elu conv elu (x), repeated."""
 
     def __init__(self, channels: int, count: int) -> None:
@@ -95,16 +95,12 @@ class _ResidualUnits(nn.Module):
         self.count = count
         for unit in range(1, count + 1):
             for layer in (1, 2):
-                self.add_module(
-                    f"{unit}_{layer}_conv", _convolution(channels, channels, bias=False)
-                )
+                self[f"{unit}_{layer}_conv"] = _convolution(channels, channels, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
         for unit in range(1, self.count + 1):
-            h = x
-            for layer in (1, 2):
-                h = self.get_submodule(f"{unit}_{layer}_conv")(F.elu(h))
-            x = x + h
+            h = self[f"{unit}_1_conv"](F.elu(x))
+            x = x + self[f"{unit}_2_conv"](F.elu(h))
         return x
 
 
@@ -170,7 +166,7 @@ class RefineNet(nn.Module):
         self.sigmas = nn.Buffer(sigmas)
         wide = 2 * width
         self.begin_conv = nn.Conv2d(channels + 2, width, 3, padding=1)
-        self.normalizer = InstanceNormPlus(width)
+        self.normalizer = _InstanceNormPlus(width)
         self.end_conv = nn.Conv2d(width, channels, 3, padding=1)
         self.res1 = nn.Sequential(_ScoreBlock(width, width), _ScoreBlock(width, width))
         self.res2 = _level(width, wide)
