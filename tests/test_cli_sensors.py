@@ -9,8 +9,7 @@ import torch
 import yaml
 
 import r2flow as package
-from r2flow.data.opening import open_scans
-from r2flow.data.reading import Reading
+from r2flow.data.opening import open_scans, reading_for
 from r2flow.errors import InputError
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
@@ -114,12 +113,13 @@ def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, t
     detected = package.read(given / "000000.bin")
     assert torch.equal(detected, package.read(given / "000000.bin", "pandar64"))
     assert torch.equal(detected, open_scans(given / "000000.bin").source.batch([0])[0])
-    assert open_scans(given, sensor="vlp16", size=(4, 64)).sensor.shape == (4, 64)
+    assert open_scans(given, reading_for([given], sensor="vlp16", size=(4, 64))).sensor.shape == (
+        4,
+        64,
+    )
     for wrong in (given, f"folder:{given}"):
         with pytest.raises(InputError, match="is a folder"):
             package.read(wrong)
-    with pytest.raises(InputError, match="not both"):
-        open_scans(given, Reading(SENSORS["hdl64e"]), sensor="vlp16")
 
 
 def test_a_thinned_scan_is_not_taken_for_another_sensors(

@@ -211,7 +211,7 @@ def test_scans_of_any_loader(tmp_path: Path):
 
 def test_other_scans_than_the_module_s_are_refused(tmp_path: Path):
     with pytest.raises(
-        InputError, match="the module's images are 64x1024 of hdl64e, the data's 8x64"
+        InputError, match="the module's images are of hdl64e 64x1024, the data's of"
     ):
         quiet_trainer(tmp_path, max_steps=1).fit(Rectify("hdit_tiny"), scans())
 

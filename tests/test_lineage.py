@@ -173,7 +173,7 @@ def test_full_reflectance_is_what_was_given_else_the_sensors_and_one_in_what_r2f
     (tmp_path / "scans" / "manifest.json").write_text('{"version": 1}')  # of a data set
     data = data_options(name=name, root=str(tmp_path / root), reading={"reflectance_scale": given})
     (one,) = plan_data(data, SENSOR_012).sets
-    assert one.reading.reflectance_scale == expected
+    assert one.options.reading.reflectance_scale == expected
 
 
 def test_each_set_of_scans_says_its_whole_reading():
@@ -197,9 +197,8 @@ def test_each_set_of_scans_says_its_whole_reading():
         assert one["reading"] == {**whole, "reflectance_scale": one["reading"]["reflectance_scale"]}
     assert ScanDataModule(**found).described() == found  # a run that is resumed says the same
     reading = {"projection": "unfolding", "reflectance_scale": 2.0}
-    scans = plan_data(
-        data_options(name="pairs", scans=part, reading=reading), SENSOR_012
-    ).scans.reading
+    beside = plan_data(data_options(name="pairs", scans=part, reading=reading), SENSOR_012).scans
+    scans = beside.options.reading
     assert (scans.projection, scans.reflectance_scale) == ("unfolding", 0.012)
 
 

@@ -25,7 +25,7 @@ from r2flow.data.loader import (
     RunSampler,
 )
 from r2flow.data.opening import Described
-from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions
+from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, PartOptions
 from r2flow.data.pairs import PairDataset, PairStore
 from r2flow.data.reading import AUTO, Reading
 from r2flow.data.resolving import lacking_reflectance, plan_data, reflectance_levels
@@ -33,7 +33,7 @@ from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
 from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding, encoding_options
 from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
-from r2flow.registry import check_options, construct
+from r2flow.registry import construct
 from r2flow.signals import init_loader_worker
 
 log = logging.getLogger(__name__)
@@ -89,9 +89,6 @@ class ScanDataModule(L.LightningDataModule):
                     "data.augment changes scans, and an augmented pair is not a flow's; leave it "
                     "out."
                 )
-        self.described_sets = [Described(part.name, part) for part in self.plan.sets]  # listed once
-        held_out = self.plan.held_out
-        self.described_held_out = None if held_out is None else Described(held_out.name, held_out)
         self.item_format: ItemFormat | None = None
         self.names: list[str] = []
         self.opened: Sequence[Mixture] = ()  # as found, before they are read
@@ -106,13 +103,13 @@ class ScanDataModule(L.LightningDataModule):
         """The arguments of this DataModule, complete, as plain values."""
         plain = asdict(self.options)
         if self.options.parts is not None:
-            plain["parts"] = [asdict(part) for part in self.plan.sets]
+            plain["parts"] = [asdict(part.options) for part in self.plan.sets]
         elif self.plan.sets:
-            plain["reading"] = asdict(self.plan.sets[0])["reading"]
+            plain["reading"] = asdict(self.plan.sets[0].options)["reading"]
         if self.plan.held_out is not None:
-            plain["validation"]["data"] = asdict(self.plan.held_out)
+            plain["validation"]["data"] = asdict(self.plan.held_out.options)
         if self.plan.scans is not None:
-            plain["scans"] = asdict(self.plan.scans)
+            plain["scans"] = asdict(self.plan.scans.options)
         encoding = self._encoding_options
         return {**plain, "sensor": self._sensor_options, "encoding": encoding, "seed": self.seed}
 
@@ -123,21 +120,23 @@ class ScanDataModule(L.LightningDataModule):
         """
         options = dict(self._encoding_options)
         if options["reflectance"] == AUTO:
-            held_out = [self.described_held_out] if self.described_held_out else []
-            lacking = lacking_reflectance([*self.described_sets, *held_out])
+            held_out = [self.plan.held_out] if self.plan.held_out else []
+            lacking = lacking_reflectance([*self.plan.sets, *held_out])
             if lacking:
                 log.info("range alone is learned (encoding.reflectance=auto): %s", lacking)
             options["reflectance"] = lacking is None
         if options["levels"] is None and self.plan.sets:
-            options["levels"] = reflectance_levels(self.described_sets)
-        return Encoding(self.sensor, **check_options("encoding", Encoding, options, given=1))
+            options["levels"] = reflectance_levels(self.plan.sets)
+        return construct("encoding", Encoding, options, self.sensor)
 
     @property
     def sensors(self) -> list[Sensor]:
         """The sensor of each set of scans."""
-        return [
-            build_sensor(**part.sensor) if part.sensor else self.sensor for part in self.plan.sets
-        ]
+        return [build_sensor(**part.sensor) if part.sensor else self.sensor for part in self._parts]
+
+    @property
+    def _parts(self) -> list[PartOptions]:
+        return [part.options for part in self.plan.sets if isinstance(part.options, PartOptions)]
 
     @property
     def format(self) -> ItemFormat:
@@ -180,7 +179,7 @@ class ScanDataModule(L.LightningDataModule):
                 self.training_source
             )  # refuses wrong weights before anything is read or written
         elif self.plan.scans is not None and self.scans is None:
-            self.scans = Mixture([self._open(Described(self.plan.scans.name, self.plan.scans))])
+            self.scans = Mixture([self._open(self.plan.scans)])
             self.names = list(self.scans.names)
             self.opened = [self.scans]
 
@@ -188,22 +187,20 @@ class ScanDataModule(L.LightningDataModule):
         """Make the items that a module takes; refuses scans that it cannot learn from."""
         sensor = wanted.encoding.sensor
         if self.pairs is None and not sensor.same_image(self.sensor):
-            ours, theirs = (
-                "x".join(map(str, one.shape)) + f" of {one.name}" for one in (self.sensor, sensor)
-            )
             raise InputError(
-                f"the module's images are {theirs}, the data's {ours}: give both the same sensor."
+                f"the module's images are of {sensor}, the data's of {self.sensor}: give both the "
+                "same sensor."
             )
-        several = any(part.sensor for part in self.plan.sets)
+        several = any(part.sensor for part in self._parts)
         if several and not wanted.several_sensors:
             raise InputError(
                 "this stage learns from scans of one sensor: leave sensor out of data.parts."
             )
+        rows, columns = wanted.smallest
         for number, one in enumerate(self.sensors if several else ()):
-            if one.shape[0] < wanted.smallest[0] or one.shape[1] < wanted.smallest[1]:
-                least = "x".join(map(str, wanted.smallest))
+            if one.shape[0] < rows or one.shape[1] < columns:
                 raise InputError(
-                    f"data.parts[{number}]: crops of {least} need images as large, found "
+                    f"data.parts[{number}]: crops of {rows}x{columns} need images as large, found "
                     f"{one.shape}."
                 )
         self.item_format = wanted
@@ -226,27 +223,25 @@ class ScanDataModule(L.LightningDataModule):
         """
         whole: list[ScanSource] = []
         first_scene = 0  # parts and held-out scans have different simulated scenes
-        for scans, sensor in zip(self.described_sets, self.sensors, strict=True):
+        for scans, sensor in zip(self.plan.sets, self.sensors, strict=True):
             whole.append(self._open(scans, first_scene, sensor))
             first_scene += scans.options.scenes if scans.options.name == SIMULATED else 0
         for number, source in enumerate(whole):
-            label = (
-                f"{number}: " if len(whole) > 1 else ""
-            )  # makes the names of the parts' scans distinct
+            # a number makes the names of several parts' scans distinct
+            label = f"{number}: " if len(whole) > 1 else ""
             self.names += [f"{label}{name}" for name in source.names]
-        other = self.described_held_out
-        training, held = whole, list[ScanSource]()
-        if other is not None:
-            held = [self._open(other, first_scene)]
+        if self.plan.held_out is not None:
+            training = whole
+            held = [self._open(self.plan.held_out, first_scene)]
         else:
             training = []
+            held = []
             for source in whole:
                 starts = sorted(numbers[0] for numbers in source.drives.values() if len(numbers))
                 first, last = holdout_block(len(source), self.options.validation.share, starts)
                 training.append(source.subset(first))
                 held.append(source.subset(last))
-        if other is not None or len(whole) > 1:
-            self._warn_of_shared(training, held)
+        self._warn_of_shared(training, held)
         validation = Mixture(held)
         return Mixture(training), validation.subset(
             spread(len(validation), self.options.validation.scans)
@@ -256,16 +251,10 @@ class ScanDataModule(L.LightningDataModule):
         trained = set[str]().union(*(source.places() for source in training))
         validated = set[str]().union(*(source.places() for source in held))
         if shared := trained & validated:
-            what = (
-                "data.validation.data" if self.plan.held_out else "a held-out block of data.parts"
-            )
-            advice = "give each set its own split or drives"
             log.warning(
-                "%s holds %d scans that are trained on, as %s: %s",
-                what,
+                "%d held-out scans are trained on, as %s: give each set its own split or drives",
                 len(shared),
                 min(shared),
-                advice,
             )
 
     def _open(
@@ -277,7 +266,7 @@ class ScanDataModule(L.LightningDataModule):
         return scans.open(reading, self.seed, first_scene)
 
     def _order(self, source: Scans) -> Order:
-        weights = [part.weight for part in self.plan.sets if part.weight is not None]
+        weights = [part.weight for part in self._parts if part.weight is not None]
         if isinstance(source, Mixture) and len(weights) > 1:
             return MixedOrder([len(part) for part in source.parts], weights, self.seed)
         return Permutations(len(source), self.seed)
@@ -286,9 +275,9 @@ class ScanDataModule(L.LightningDataModule):
         """Identity of the data, independent of its path: a run resumes only with the same scans and
         order.
         """
-        texts = (
-            [] if self.pairs is None else [f"{self.pairs.num} pairs, {self.pair_store.digest[:16]}"]
-        )
+        texts = []
+        if self.pairs is not None:
+            texts.append(f"{self.pairs.num} pairs, {self.pair_store.digest[:16]}")
         if self.opened:
             known = [*self.names, *(source.contents for source in self.opened)]
             digest = hashlib.sha256(os.fsencode("\n".join(known))).hexdigest()[:12]
@@ -302,7 +291,7 @@ class ScanDataModule(L.LightningDataModule):
         assert isinstance(self.training_source, Mixture)
         counts = [
             f"{len(part)} {named.options.name} scans"
-            for named, part in zip(self.described_sets, self.training_source.parts, strict=True)
+            for named, part in zip(self.plan.sets, self.training_source.parts, strict=True)
         ]
         held = len(self.names) - len(self.training_source)
         return f"{' and '.join(counts)}, {held} held out"
@@ -311,10 +300,8 @@ class ScanDataModule(L.LightningDataModule):
         """The source with its slow parts read into memory, if they fit into `memory_gib`."""
         parts = [*source.parts]
         firsts = {i: part[0] for i, part in enumerate(parts) if part.slow and len(part)}
-        if (
-            sum(4 * len(parts[i]) * first.size for i, first in firsts.items())
-            > self.options.memory_gib * 2**30
-        ):
+        size = sum(len(parts[i]) * first.nbytes for i, first in firsts.items())
+        if size > self.options.memory_gib * 2**30:
             return source
         for i, first in firsts.items():
             parts[i] = InMemory(parts[i].read_all(what, first.shape), parts[i].names)
@@ -384,21 +371,16 @@ class ScanDataModule(L.LightningDataModule):
         sensors = self.sensors if purpose == "training" or self.plan.held_out is None else []
         return FlowDataset(source, item_format, self.seed, purpose, augment, sensors)
 
-    def val_dataloader(self) -> DataLoader[Item] | list[Any]:
-        """The held-out scans, each once, without those that are left when the devices share them
-        equally.
-        """
-        return self._held_out_loader()
-
     def test_dataloader(self) -> DataLoader[Item] | list[Any]:
         """The held-out scans, to compare generated scans with."""
-        return self._held_out_loader(whole=True)
+        return self.val_dataloader(whole=True)
 
-    def predict_dataloader(self) -> DataLoader[Item] | list[Any]:
-        """The held-out scans, for as many predictions."""
-        return self._held_out_loader(whole=True)
+    predict_dataloader = test_dataloader
 
-    def _held_out_loader(self, whole: bool = False) -> DataLoader[Item] | list[Any]:
+    def val_dataloader(self, whole: bool = False) -> DataLoader[Item] | list[Any]:
+        """The held-out scans, each once, without those that are left when the devices share them
+        equally; `whole`: without the stage's further entries.
+        """
         _, source = self._ready()
         if len(source) == 0:
             return []

@@ -4,7 +4,7 @@ import logging
 import os
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 from r2flow.data.options import SourceOptions
 from r2flow.data.reading import Reading, lacks_reflectance, leaving_out
 from r2flow.data.sources import ScanFiles, ScanSource, warn_of_other_sensor
-from r2flow.errors import InputError, check, warn_odd
+from r2flow.errors import InputError, warn_odd
 from r2flow.lidar.scan_files import (
-    ELSEWHERE,
     FIRM_ENDINGS,
     LOOSE_ENDINGS,
     TABLE_ENDINGS,
+    conversion_of,
     scan_ending,
 )
 from r2flow.store import manifest_of
@@ -105,12 +105,8 @@ class SourceKind(ABC):
         """Select drives by a part of the split, then by names or numbers; None takes all."""
         if split is not None:
             if split not in self.splits:
-                splits = (
-                    f"known: {', '.join(self.splits)}"
-                    if self.splits
-                    else "the data set has no standard split"
-                )
-                raise InputError(f"no split named {split!r}; {splits}.")
+                known = ", ".join(self.splits) or "none, the data set has no standard split"
+                raise InputError(f"no split named {split!r}; known: {known}.")
             drives = [drive for drive in drives if self.split_of(drive.name) == split]
         if names is None:
             return drives
@@ -133,12 +129,11 @@ class Layout(SourceKind):
         """The drives of the split and the names in `options`, without empty drives."""
         name, split, root = options.name, options.split, options.folder
         self.chosen([], split, None)  # refuses an unknown split before any search
-        found = root.is_dir()
-        check(
-            found,
-            f"{root} is not a folder. Give that of the scans (data.root=FOLDER; in a verb "
-            f"{name}:FOLDER).",
-        )
+        if not root.is_dir():
+            raise InputError(
+                f"{root} is not a folder. Give that of the scans (data.root=FOLDER; in a verb "
+                f"{name}:FOLDER)."
+            )
         nonempty = [drive for drive in self.find(root) if drive.scans]
         if not nonempty:
             where = (self.find.__doc__ or "scan files").splitlines()[0]
@@ -170,7 +165,9 @@ class Layout(SourceKind):
             drives[drive.name] = range(first, first + len(drive.scans))
             first += len(drive.scans)
         options = scans.options
-        about = {"kind": options.name, **({"split": options.split or "all"} if self.splits else {})}
+        about = {"kind": options.name}
+        if self.splits:
+            about["split"] = options.split or "all"
         warn_of_other_sensor(scans.paths, reading, options.folder, scans.made_here)
         return ScanFiles(scans.paths, reading, options.folder, drives, about)
 
@@ -182,32 +179,32 @@ class Layout(SourceKind):
 def kitti_360(root: Path) -> list[Drive]:
     """`data_3d_raw/2013_05_28_drive_XXXX_sync/velodyne_points/data/*.bin`."""
     base = root / "data_3d_raw" if (root / "data_3d_raw").is_dir() else root
-    folders = sorted(base.glob("2013_05_28_drive_*_sync/velodyne_points/data"))
-    return [Drive(folder.parent.parent.name, _files(folder, (".bin",))) for folder in folders]
+    return _drives(base.glob("2013_05_28_drive_*_sync/velodyne_points/data"), 1)
 
 
 def kitti_raw(root: Path) -> list[Drive]:
     """`DATE/DATE_drive_XXXX_sync/velodyne_points/data/*.bin`."""
     below = "*_drive_*_sync/velodyne_points/data"
-    folders = sorted([*root.glob(f"*/{below}"), *root.glob(below)])
-    return [Drive(folder.parent.parent.name, _files(folder, (".bin",))) for folder in folders]
+    return _drives([*root.glob(f"*/{below}"), *root.glob(below)], 1)
 
 
 def odometry(root: Path) -> list[Drive]:
     """`sequences/XX/velodyne/*.bin`, also below `dataset/`: KITTI odometry and SemanticKITTI."""
     base = root / "dataset" if (root / "dataset" / "sequences").is_dir() else root
-    folders = sorted(f for f in base.glob("sequences/*/velodyne") if f.parent.name.isdecimal())
-    return [Drive(folder.parent.name, _files(folder, (".bin",))) for folder in folders]
+    folders = base.glob("sequences/*/velodyne")
+    return _drives((folder for folder in folders if folder.parent.name.isdecimal()), 0)
 
 
 def kitti_object(root: Path) -> list[Drive]:
     """`training/velodyne/*.bin` and `testing/velodyne/*.bin`: KITTI object, each scan another
     place.
     """
-    folders = [
-        folder for name in ("training", "testing") if (folder := root / name / "velodyne").is_dir()
-    ]
-    return [Drive(folder.parent.name, _files(folder, (".bin",))) for folder in folders]
+    return _drives(root.glob("training/velodyne"), 0) + _drives(root.glob("testing/velodyne"), 0)
+
+
+def _drives(folders: Iterable[Path], up: int) -> list[Drive]:
+    """Drives of .bin in folders, named by a folder above them."""
+    return [Drive(folder.parents[up].name, _files(folder, (".bin",))) for folder in sorted(folders)]
 
 
 def nuscenes(root: Path) -> list[Drive]:
@@ -293,13 +290,7 @@ def _elsewhere(root: Path) -> str:
     form.
     """
     paths = (os.path.join(place, name) for place, names in _walk(root) for name in sorted(names))
-    known = (
-        (path, advice)
-        for path in paths
-        for end, advice in ELSEWHERE.items()
-        if path.lower().endswith(end)
-    )
-    return next((f" {path} {advice.format(path=path)}." for path, advice in known), "")
+    return next((f" {path} {advice}." for path in paths if (advice := conversion_of(path))), "")
 
 
 def _one_of_each(paths: tuple[str, ...]) -> tuple[str, ...]:
@@ -318,10 +309,7 @@ def named_drive(drives: list[Drive], name: str) -> Drive:
     if len(matches) != 1:
         names = [drive.name for drive in drives]
         listed = "none, its scans are in one folder" if names == ["."] else ", ".join(names)
-        raise InputError(
-            f"{len(matches) or 'no'} drive{'s' * (len(matches) > 1)} named {name!r}; known: "
-            f"{listed}."
-        )
+        raise InputError(f"{len(matches) or 'no'} drives named {name!r}; known: {listed}.")
     return matches[0]
 
 

@@ -1,6 +1,7 @@
 """The images of a run as resumable batches, also of mixtures of data sets."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -36,6 +37,7 @@ class ItemFormat(NamedTuple):
     smallest: tuple[int, int] = (1, 1)  # rows and columns that `further` needs
 
 
+@dataclass(eq=False)
 class FlowDataset(Dataset[Item]):
     """Image k of a run as a training item.
 
@@ -51,22 +53,16 @@ class FlowDataset(Dataset[Item]):
     A mixture has a sensor per part; images of several sizes need a `further` that crops them.
     """
 
-    def __init__(
-        self,
-        source: ScanSource,
-        item_format: ItemFormat,
-        seed: int,
-        purpose: str,
-        augment: Augmentation | None = None,
-        sensors: Sequence[Sensor] = (),
-    ) -> None:
-        self.source = source
-        self.format = item_format
-        self.seed = seed
-        self.purpose = purpose
-        self.augment = augment
-        encoding = item_format.encoding
-        self.encodings = [encoding.through(sensor) for sensor in sensors] or [encoding]
+    source: ScanSource
+    format: ItemFormat
+    seed: int
+    purpose: str
+    augment: Augmentation | None = None
+    sensors: Sequence[Sensor] = ()
+
+    def __post_init__(self) -> None:
+        encoding = self.format.encoding
+        self.encodings = [encoding.through(sensor) for sensor in self.sensors] or [encoding]
 
     def __len__(self) -> int:
         return len(self.source)
@@ -78,11 +74,12 @@ class FlowDataset(Dataset[Item]):
         u = torch.tensor(draw.random(dtype=np.float32))
         encoding = self.encodings[self.source.locate(index)[0]]
         image = self.source[index][: encoding.channels]
-        if image.shape != encoding.shape:
-            raise InputError(
-                f"{self.source.names[index]}: an image of {encoding.shape}, found {image.shape}."
-            )
-        if wrong := wrong_with(torch.from_numpy(image), max(FAR, encoding.sensor.max_range)):
+        if image.shape == encoding.shape:
+            far = max(FAR, encoding.sensor.max_range)
+            wrong = wrong_with(torch.from_numpy(image), far)
+        else:
+            wrong = f"an image of {encoding.shape}, found {image.shape}"
+        if wrong:
             raise InputError(f"{self.source.names[index]}: {wrong}.")
         if self.augment:
             image = self.augment(image, self.seed, k)
@@ -123,6 +120,7 @@ class Permutations:
         return int(self.order[turn])
 
 
+@dataclass(eq=False)
 class RunSampler(DistributedSampler[Key]):
     """The images of one rank in an epoch of a run, or a validation, as (k, scan).
 
@@ -138,20 +136,12 @@ class RunSampler(DistributedSampler[Key]):
             a resumed run skips; None: the first k of the epoch that `set_epoch` names.
     """
 
-    def __init__(
-        self,
-        order: Order,
-        images: int,
-        rank: int = 0,
-        ranks: int = 0,
-        place: Callable[[], tuple[int, int]] | None = None,
-    ) -> None:
-        self.order = order
-        self.images = images
-        self.rank = rank
-        self.ranks = ranks
-        self.place = place
-        self.epoch = 0
+    order: Order
+    images: int
+    rank: int = 0
+    ranks: int = 0
+    place: Callable[[], tuple[int, int]] | None = None
+    epoch: int = 0  # as Lightning sets it by `set_epoch`; `place` does not depend on it
 
     def _share(self) -> tuple[int, int]:
         return (self.rank, self.ranks) if self.ranks else rank_and_world_size()
@@ -166,17 +156,13 @@ class RunSampler(DistributedSampler[Key]):
         for k in range(first + rank, first + self.images - done, ranks):
             yield k, self.order[k]
 
-    def set_epoch(self, epoch: int) -> None:
-        """Begin another epoch, as Lightning does; `place` does not depend on it."""
-        self.epoch = epoch
-
 
 class Mixture(ScanSource):
     """Concatenated sources."""
 
     def __init__(self, parts: Sequence[ScanSource]) -> None:
         self.parts = list(parts)
-        self.starts = np.cumsum([0, *(len(part) for part in parts)])
+        self.starts = np.cumsum([0, *map(len, parts)])
 
     @property
     def names(self) -> list[str]:

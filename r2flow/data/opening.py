@@ -66,13 +66,12 @@ class Prepared(SourceKind):
         layout = store.described["layout"]
         kind = SOURCES[layout if layout in SOURCES else FOLDER]
         if options.split is None and options.drives is None:
-            parts = sorted({part for drive in store.drives if (part := kind.split_of(drive.name))})
+            parts = {kind.split_of(drive.name) for drive in store.drives} - {None}
             if len(parts) > 1:
-                held = " and ".join(parts)
                 log.warning(
                     "%s holds %s drives, and data.split=null takes all of them",
                     options.folder,
-                    held,
+                    " and ".join(sorted(map(str, parts))),
                 )
         place = {name: number for number, name in enumerate(store.names)}
         chosen = kind.chosen(store.drives, options.split, options.drives)
@@ -80,10 +79,9 @@ class Prepared(SourceKind):
         return PreparedScans(store, numbers, bool(reading.reflectance))
 
     def lacks_reflectance(self, scans: "Described", on_bad_scan: str = "error") -> str | None:
-        folder = scans.options.folder
-        return (
-            f"the scans in {folder} have no reflectance" if self.levels_of(scans) is None else None
-        )
+        if self.levels_of(scans) is None:
+            return f"the scans in {scans.options.folder} have no reflectance"
+        return None
 
     def levels_of(self, scans: "Described") -> int | None:
         return read_prepared(scans.options.folder).described["levels"]
@@ -145,11 +143,9 @@ class Described:
         if described is None:
             return None
         stored = Reading.of(described)
-        return (
-            replace(stored, reflectance=AUTO, within_limits=False)
-            if self.options.name == PREPARED
-            else stored
-        )
+        if self.options.name == PREPARED:
+            stored = replace(stored, reflectance=AUTO, within_limits=False)
+        return stored
 
     @cached_property
     def made_here(self) -> bool:
@@ -196,15 +192,10 @@ class Described:
         """Refuse samples or completed scans of another sensor or size."""
         if not self.is_samples or self.stored is None or self.stored.sensor.same_image(sensor):
             return
-        theirs, ours = (
-            f"{one.name} {one.shape[0]}x{one.shape[1]}" for one in (self.stored.sensor, sensor)
-        )
         raise InputError(
-            f"{self.options.folder} holds images of {theirs} (in its {MANIFEST}), not of {ours}: "
-            "give no other "
-            "--sensor or --size, no scans of another sensor next to them, and for a model of "
-            "another sensor point "
-            "clouds (.ply, .bin)."
+            f"{self.options.folder} holds images of {self.stored.sensor} (in its {MANIFEST}), not "
+            f"of {sensor}: give no other --sensor or --size, no scans of another sensor next to "
+            "them, and for a model of another sensor point clouds (.ply, .bin)."
         )
 
     def refuse_parts(self) -> None:
@@ -214,8 +205,7 @@ class Described:
         if self.manifest.get("recipe", {}).get("region"):
             raise InputError(
                 f"{self.label} holds a part of each scan alone (see its {MANIFEST}) and cannot be "
-                "compared with whole "
-                "scans: sample without --sector and --rows."
+                "compared with whole scans: sample without --sector and --rows."
             )
 
 
@@ -280,15 +270,13 @@ def open_scans(
     split: str | None = None,
     num: int | None = None,
     own_size: bool = False,
-    sensor: Sensor | str | None = None,
-    size: tuple[int, int] | None = None,
 ) -> ScanSet:
     """Open the scans of a name. Scans are read on access, except those that decide whether the set
     has reflectance.
 
     Args:
         spec: As for `describe`.
-        reading: How scans become images; None: `reading_for([spec], sensor=sensor, size=size)`.
+        reading: How scans become images; None: `reading_for([spec])`.
         split: A part of the data set's standard split.
         num: Maximum number of scans, chosen by a fixed shuffle; the number of simulated scenes.
         own_size: For pictures: take the size of the range image instead of the sensor's, and do not
@@ -297,17 +285,14 @@ def open_scans(
     scans = describe(spec)
     if num is not None and num < 1:
         raise InputError(f"num must be at least 1, or None for all scans; found {num!r}.")
-    if reading is not None and (sensor is not None or size is not None):
-        raise InputError("give a reading, or a sensor and a size, not both.")
-    reading = reading or reading_for([scans], sensor=sensor, size=size)
+    reading = reading or reading_for([scans])
     simulated = scans.options.name == SIMULATED
     if split and (scans.file or simulated):
         raise InputError(f"{scans.label} has no split: leave {split!r} out.")
     if scans.file is None:
-        if split or simulated or reading.columns:
-            scans = scans.part(
-                split=split, scenes=num or SCENES, reading=ReadingOptions(columns=reading.columns)
-            )
+        if split or simulated or reading.columns:  # else what is listed stays so
+            columns = ReadingOptions(columns=reading.columns)
+            scans = scans.part(split=split, scenes=num or SCENES, reading=columns)
         seed = int(scans.options.root or 0) if simulated else 0
         return ScanSet(scans.label, scans.open(reading, seed), reading.sensor).limited(num)
     image = read_range_image(scans.file)
@@ -322,7 +307,7 @@ def open_scans(
     if reading.reflectance == AUTO:
         lacking = lacks_reflectance([scans.file], reading.on_bad_scan, reading.columns)
         reading = replace(reading, reflectance=lacking is None)
-    source = ScanFiles([scans.file], reading, scans.file.parent, about={"kind": "file"})
+    source = ScanFiles([scans.file], reading, scans.file.parent, described={"kind": "file"})
     return ScanSet(scans.label, source, reading.sensor)
 
 
@@ -365,9 +350,9 @@ def reading_for(
         sensor = _detected(first, reading)
     chosen = named_sensor(sensor or reading.sensor, size)
     if model is not None and not chosen.same_image(model.sensor):
-        expected, asked = (f"{s.name} {s.shape[0]}x{s.shape[1]}" for s in (model.sensor, chosen))
         raise InputError(
-            f"the flow's images are of {expected}, not of {asked}; leave --sensor and --size out."
+            f"the flow's images are of {model.sensor}, not of {chosen}; leave --sensor and --size "
+            "out."
         )
     reading = replace(reading, sensor=reading.sensor if model else chosen)
     if "reflectance_scale" in given:
@@ -402,16 +387,13 @@ def _reading_of(model: Any) -> Reading:
     agree.
     """
     data = model.config.get("data", {})
-    readings = [part.get("reading") for part in data.get("parts") or ()] or [data.get("reading")]
-    fields = ("projection", "convention", "reflectance_scale")
+    first, *others = [part.get("reading") or {} for part in data.get("parts") or [data]]
     agreed = {
-        key: values.pop()
-        for key in fields
-        if len(values := {(r or {}).get(key) for r in readings}) == 1
+        key: first[key]
+        for key in ("projection", "convention", "reflectance_scale")
+        if first.get(key) is not None and all(other.get(key) == first[key] for other in others)
     }
-    return Reading(
-        model.sensor, **{key: value for key, value in agreed.items() if value is not None}
-    )
+    return Reading(model.sensor, **agreed)
 
 
 def read(

@@ -4,6 +4,7 @@ import math
 import os
 import random
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -75,29 +76,25 @@ class PairStore(Store):
     def has(self, item: int) -> bool:
         """Whether a shard exists and has all batches that the first `num` pairs need."""
         try:
-            return (
-                len(self.head(item)["usable"])
-                >= len(self.batches_of(item)) * self.options.batch_size
-            )
+            return len(self.head(item)["usable"]) >= self.pairs_of(item)
         except (FileNotFoundError, Damaged):
             return False
 
+    def pairs_of(self, shard: int) -> int:
+        return len(self.batches_of(shard)) * self.options.batch_size
+
     def missing_pairs(self) -> int:
-        return (
-            sum(len(self.batches_of(shard)) for shard in self.missing(self.shards))
-            * self.options.batch_size
-        )
+        return sum(map(self.pairs_of, self.missing(self.shards)))
 
     def usable(self) -> np.ndarray:
         """The numbers of the usable pairs, from 0; refuses a folder that lacks pairs."""
-        num, lacking = self.options.num, min(self.missing_pairs(), self.options.num)
-        check(
-            not lacking,
-            f"{self.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN.",
-        )
-        return np.flatnonzero(
-            [flag for shard in self.shards for flag in self.head(shard)["usable"]][:num]
-        )
+        num = self.options.num
+        if lacking := min(self.missing_pairs(), num):
+            raise InputError(
+                f"{self.folder} lacks about {lacking} of {num} pairs; make them: r2flow pairs RUN."
+            )
+        flags = [flag for shard in self.shards for flag in self.head(shard)["usable"]]
+        return np.flatnonzero(flags[:num])
 
     def noise(self, index: int) -> Tensor:
         """x_0 of a pair, which is not stored: the noise of (seed, "pairs", index)."""
@@ -125,25 +122,20 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
         sampler.paired,
         f"pairs are the two ends of a path, and sampler {sampler.name} leaves it: give a solver.",
     )
-    usable, evaluations, start, seconds = (
-        list[bool](),
-        0,
-        time.monotonic(),
-        0.0,
-    )  # without waiting for others
-    launcher = (
-        os.getppid() if int(os.environ.get("LOCAL_RANK") or 0) else None
-    )  # the process that started this one
+    usable: list[bool] = []
+    evaluations = 0
+    start = time.monotonic()
+    seconds = 0.0  # without waiting for others
+    launcher = os.getppid()
+    launched = int(os.environ.get("LOCAL_RANK") or 0) > 0
 
     def make_shard(shard: int) -> None:
         nonlocal evaluations, seconds
         store.mend(shard)
         batches = []
         for batch in store.batches_of(shard):
-            if launcher not in (
-                None,
-                os.getppid(),
-            ):  # killed: this process would draw all pairs and then fail
+            # killed: this process would draw all pairs and then fail
+            if launched and os.getppid() != launcher:
                 raise Stopped(LATER, "stopped: the process that launched this one has ended")
             batches.append(solve_batch(store, flow, batch))
             evaluations += int(batches[-1]["evaluations"].sum())
@@ -170,12 +162,12 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
         )  # shuffled: processes rarely meet, also without common locks
         store.make(random.Random().sample(missing, len(missing)), make_shard, wait=wait)
     if usable:
-        unusable = (
-            "" if all(usable) else f", {usable.count(False)} did not converge and are left out"
+        print(
+            f"{len(usable)} pairs drawn in whole batches, {len(usable) / seconds:.2f} pairs/s, "
+            f"{evaluations / len(usable):.1f} evaluations a pair, {usable.count(False)} did not "
+            "converge and are left out",
+            flush=True,
         )
-        rate, cost = len(usable) / seconds, evaluations / len(usable)
-        drawn = f"{len(usable)} pairs drawn in whole batches"
-        print(f"{drawn}, {rate:.2f} pairs/s, {cost:.1f} evaluations a pair{unusable}", flush=True)
     return usable
 
 
@@ -185,9 +177,8 @@ def solve_batch(store: PairStore, generator: Flow, batch: int) -> dict[str, np.n
     x_1 is float16, (B, C, H, W); pairs that overflow float16 are not usable.
     """
     options, sampler = store.options, store.sampler
-    indices = range(
-        store.first + batch * options.batch_size, store.first + (batch + 1) * options.batch_size
-    )
+    first = store.first + batch * options.batch_size
+    indices = range(first, first + options.batch_size)
     x_0 = torch.stack([store.noise(index) for index in indices]).to(generator.device)
     fresh = noise.Draws(options.seed, indices, "pairs") if sampler.draws else None
     end = generator(x_0, sampler=sampler, draws=fresh, precision=options.precision)
@@ -199,6 +190,7 @@ def solve_batch(store: PairStore, generator: Flow, batch: int) -> dict[str, np.n
     }
 
 
+@dataclass(eq=False)
 class PairDataset(Dataset[Item]):
     """Some pairs of a store as training items; u depends only on (seed, purpose, k).
 
@@ -206,22 +198,15 @@ class PairDataset(Dataset[Item]):
     space, and noise, (*noise_shape), independent of it.
     """
 
-    def __init__(
-        self,
-        store: PairStore,
-        numbers: np.ndarray,
-        seed: int,
-        purpose: str,
-        scans: FlowDataset | None = None,
-    ) -> None:
-        self.store, self.numbers, self.seed, self.purpose, self.scans = (
-            store,
-            numbers,
-            seed,
-            purpose,
-            scans,
-        )
-        self.order = Permutations(0 if scans is None else len(scans), seed)
+    store: PairStore
+    numbers: np.ndarray
+    seed: int
+    purpose: str
+    scans: FlowDataset | None = None
+
+    def __post_init__(self) -> None:
+        if self.scans is not None:
+            self.order = Permutations(len(self.scans), self.seed)
 
     def __len__(self) -> int:
         return len(self.numbers)

@@ -25,7 +25,13 @@ from r2flow.config import at_most_three, differences
 from r2flow.data.layouts import Drive
 from r2flow.data.quantise import OTHER_LEVELS, find_levels, range_codes, reflectance_codes
 from r2flow.data.reading import Reading, lacks_reflectance, read_image
-from r2flow.data.sources import ScanFiles, ScanSource, spread, warn_of_other_sensor
+from r2flow.data.sources import (
+    ScanFiles,
+    ScanSource,
+    drives_within,
+    spread,
+    warn_of_other_sensor,
+)
 from r2flow.errors import InputError, check
 from r2flow.files import reading_errors
 from r2flow.progress import Bar, track
@@ -119,21 +125,21 @@ def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
 
 def _make_shard(store: PreparedStore, skip: bool, shard: int) -> None:
     assert store.source is not None
-    left_out, codes = list[int](), {name: list[np.ndarray]() for name in store.codes}
+    left_out: list[int] = []
+    images: list[np.ndarray] = []
     for number in store.parts[shard]:
         try:
-            image = store.source[number]
+            images.append(store.source[number])
         except InputError as error:
             if not skip:
                 raise
             log.warning("left out: %s", error)
             left_out.append(number)
-            continue
-        for channel, (name, coder) in zip(image, store.codes.items(), strict=True):
-            codes[name].append(coder.encode(channel))
-    empty = np.empty((0, *store.reading.sensor.shape))
+    shape = len(images), len(store.codes), *store.reading.sensor.shape
+    channels = np.reshape(images, shape).swapaxes(0, 1)
     tensors = {
-        name: np.array(codes[name] or empty, coder.dtype) for name, coder in store.codes.items()
+        name: coder.encode(channel)
+        for channel, (name, coder) in zip(channels, store.codes.items(), strict=True)
     }
     store.write(shard, tensors, {"left_out": left_out, "files": store.sources_of(shard)})
 
@@ -193,21 +199,18 @@ def refuse_other_images(store: PreparedStore, reading: Reading) -> None:
     """
     # Images do not depend on these fields; the order of the lasers determines the rows in unfolding
     # only.
-    irrelevant = (
-        {"name", "height"} if reading.projection == "unfolding" else {"name", "height", "firing"}
-    )
+    irrelevant = {"name", "height"}
+    if reading.projection != "unfolding":
+        irrelevant.add("firing")
     images = []
     for fields in (store.described["reading"], reading.described()):
-        sensor = {key: value for key, value in fields["sensor"].items() if key not in irrelevant}
-        images.append(
-            {**sensor, "projection": fields["projection"], "convention": fields["convention"]}
-        )
+        image = {**fields["sensor"], **{key: fields[key] for key in ("projection", "convention")}}
+        images.append({key: value for key, value in image.items() if key not in irrelevant})
     if differing := [*differences(*images).values()]:
         stored = store.reading
         raise InputError(
-            f"{store.folder} was prepared for other images (sensor {stored.sensor.name}, "
-            f"{stored.sensor.shape[0]}x{stored.sensor.shape[1]}, {stored.projection}, "
-            f"{stored.convention}): "
+            f"{store.folder} was prepared for other images (sensor {stored.sensor}, "
+            f"{stored.projection}, {stored.convention}): "
             f"{at_most_three(differing)}. Give the run the same, or prepare the scans for it."
         )
 
@@ -218,15 +221,13 @@ class PreparedScans(ScanSource):
     """
 
     def __init__(self, store: PreparedStore, numbers: Sequence[int], reflectance: bool) -> None:
-        self.store, self.reflectance, entries = (
-            store,
-            reflectance,
-            dict[int, tuple[int, int, int]](),
-        )
+        self.store = store
+        self.reflectance = reflectance
         if reflectance and "reflectance" not in store.codes:
             raise InputError(
                 f"{store.folder} holds scans without reflectance. Set encoding.reflectance=false."
             )
+        places: dict[int, tuple[int, int]] = {}
         for shard, numbers_of_shard in enumerate(store.parts):
             try:
                 left_out = set(store.head(shard)["left_out"])
@@ -239,13 +240,12 @@ class PreparedScans(ScanSource):
                 raise InputError(
                     f"{path} is damaged ({error}). The same r2flow prepare makes it again."
                 ) from None
-            rows = [number for number in numbers_of_shard if number not in left_out]
-            entries |= {number: (number, shard, row) for row, number in enumerate(rows)}
+            kept = [number for number in numbers_of_shard if number not in left_out]
+            places |= {number: (shard, row) for row, number in enumerate(kept)}
+        rows = [(number, *places[number]) for number in numbers if number in places]
         #: Rows of (number in the data set, shard, row of the shard).
-        self.rows = np.array([entries[n] for n in numbers if n in entries], dtype=np.int64).reshape(
-            -1, 3
-        )
-        self._shards: dict[int, list[Any]] = {}
+        self.rows = np.array(rows, dtype=np.int64).reshape(-1, 3)
+        self._shards: dict[int, dict[str, Any]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_shards": {}}  # memory maps are not pickled
@@ -264,16 +264,14 @@ class PreparedScans(ScanSource):
 
     @property
     def drives(self) -> dict[str, list[int]]:  # type: ignore[override]
-        place = {name: index for index, name in enumerate(self.names)}
-        drives = {d.name: [place[n] for n in d.scans if n in place] for d in self.store.drives}
-        return {drive: numbers for drive, numbers in drives.items() if numbers}
+        return drives_within({drive.name: drive.scans for drive in self.store.drives}, self.names)
 
     def about(self) -> dict[str, Any]:
         kind = f"prepared {self.store.described['layout']}"
         return {"kind": kind, "recipe": self.store.digest[:12], "reflectance": self.reflectance}
 
     def identity(self) -> dict[str, Any]:
-        rows = hashlib.sha256(np.ascontiguousarray(self.rows).tobytes()).hexdigest()
+        rows = checksum(self.rows.tolist())
         return {"recipe": self.contents, "rows": rows, "reflectance": self.reflectance}
 
     @cached_property
@@ -291,14 +289,14 @@ class PreparedScans(ScanSource):
 
     def __getitem__(self, index: int) -> np.ndarray:
         _, shard, row = map(int, self.rows[index])
-        codes = [*self.store.codes.items()][: 1 + self.reflectance]
         if shard not in self._shards:
-            with reading_errors(path := self.store.files(shard)[0]):  # damaged since it was opened
+            path = self.store.files(shard)[0]
+            with reading_errors(path):  # damaged since it was opened
                 file = safe_open(path, framework="numpy")
-                self._shards[shard] = [file.get_slice(name) for name, _ in codes]
-        stored = [image[row : row + 1][0] for image in self._shards[shard]]
-        values = [coder.values for _, coder in codes]
-        # No index is out of bounds; mode="clip" only skips the bounds check.
-        return np.stack(
-            [np.take(table, code, mode="clip") for table, code in zip(values, stored, strict=True)]
-        )
+                self._shards[shard] = {name: file.get_slice(name) for name in self.store.codes}
+        channels = []
+        for name, stored in [*self._shards[shard].items()][: 1 + self.reflectance]:
+            code = stored[row : row + 1][0]
+            # No index is out of bounds; mode="clip" only skips the bounds check.
+            channels.append(np.take(self.store.codes[name].values, code, mode="clip"))
+        return np.stack(channels)

@@ -22,10 +22,10 @@ class Codes:
     def __init__(
         self, values: Sequence[float], codes: Sequence[int], dtype: type[np.unsignedinteger]
     ) -> None:
-        self._knots, self.dtype = (values, codes), dtype
-        self.values = np.interp(np.arange(np.iinfo(dtype).max + 1), codes, values).astype(
-            np.float32
-        )
+        self._knots = values, codes
+        self.dtype = dtype
+        every = np.arange(np.iinfo(dtype).max + 1)
+        self.values = np.interp(every, codes, values).astype(np.float32)
 
     def encode(self, x: np.ndarray) -> np.ndarray:
         return np.rint(np.interp(x, *self._knots)).astype(self.dtype)

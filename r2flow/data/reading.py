@@ -3,13 +3,13 @@
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from r2flow.errors import InputError, check, naming, warn_odd
+from r2flow.errors import InputError, naming, warn_odd
 from r2flow.lidar.estimation import FULL_REFLECTANCE, OUTLIERS, SURE, full_reflectance
 from r2flow.lidar.labels import read_labels
 from r2flow.lidar.projection import Convention, Projection, project_indices, scatter
@@ -54,22 +54,14 @@ class Reading:
 
     def described(self) -> dict[str, Any]:
         """All fields as plain values, for manifests."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)} | {
-            "sensor": self.sensor.described()
-        }
+        values = {**vars(self), "sensor": self.sensor.described()}
         return json.loads(json.dumps(values))  # turns tuples into lists
 
     @classmethod
     def of(cls, described: Mapping[str, Any]) -> "Reading":
         """The reading of a manifest; missing fields have their defaults."""
-        columns = described.get("columns")
-        return cls(
-            **{
-                **described,
-                "sensor": Sensor(**described["sensor"]),
-                "columns": columns and tuple(columns),
-            }
-        )
+        reading = cls(**{**described, "sensor": Sensor(**described["sensor"])})
+        return replace(reading, columns=reading.columns and tuple(reading.columns))
 
     @classmethod
     def stored(cls, folder: str | Path) -> "Reading | None":
@@ -90,22 +82,21 @@ def read_projected(
         points = read_points(path, reading.columns)
         if reading.projection == "unfolding":
             points = points.with_lost_rays()
-        scaled = (
-            scaled_reflectance(path, points, reading.reflectance_scale)
-            if reading.reflectance
-            else None
-        )
+        scaled = []
+        if reading.reflectance:
+            scaled = [scaled_reflectance(path, points, reading.reflectance_scale)]
         with naming(path):
             pixels, chosen, r = project_indices(
                 points.xyz, sensor, reading.projection, reading.convention, points.ring
             )
-        image = scatter(sensor, pixels, [r] if scaled is None else [r, scaled[chosen]])
-        if not image[0].any():
+        if not r.any():
             raise nothing_in_view(path, points, sensor)
+        image = scatter(sensor, pixels, [r, *(channel[chosen] for channel in scaled)])
     except NoPointsError:
         if reading.on_bad_scan != "empty":
             raise
-        points, (pixels, chosen) = Points(np.zeros((0, 3), np.float32)), np.zeros((2, 0), np.int64)
+        points = Points(np.zeros((0, 3), np.float32))
+        pixels = chosen = np.zeros(0, np.int64)
         image = np.zeros((1 + bool(reading.reflectance), *sensor.shape), np.float32)
     return image, points, pixels, chosen
 
@@ -157,18 +148,20 @@ def scaled_reflectance(
     """
     if points.reflectance is None:
         raise _no_reflectance(path)
+    path = Path(path)
     stored = points.reflectance
     highest = float(stored.max(initial=0))
     seen = stored[stored > 0]
     scale = estimated_scale(path, [points]) if scale is None else scale
-    fractions = len(seen) and np.mean(seen > 1) <= OUTLIERS and (seen % 1).any()
-    if scale in FULL_REFLECTANCE[1:] and fractions:
-        warn_odd(
-            Path(path), f"reflectance is not divided by {scale:g}: its values are fractions of 1"
-        )
-        scale = 1.0
-    if len(seen) and (highest < FAINT * scale or np.median(seen) < DARKEST * scale):
-        warn_odd(Path(path), DARK)
+    if len(seen):
+        fractions = np.mean(seen > 1) <= OUTLIERS and (seen % 1).any()
+        if scale in FULL_REFLECTANCE[1:] and fractions:
+            warn_odd(
+                path, f"reflectance is not divided by {scale:g}: its values are fractions of 1"
+            )
+            scale = 1.0
+        if highest < FAINT * scale or np.median(seen) < DARKEST * scale:
+            warn_odd(path, DARK)
     if strict and stored.min(initial=0) < 0:
         raise InputError(
             f"{path}: reflectance must not be negative, found {stored.min():g}; correct the file."
@@ -183,7 +176,7 @@ def scaled_reflectance(
             f"its part of data.parts, or --reflectance-scale {full:g}."
         )
     if beyond:
-        warn_odd(Path(path), f"reflectance beyond {scale:g} is clipped", beyond)
+        warn_odd(path, f"reflectance beyond {scale:g} is clipped", beyond)
     return (stored / np.float32(scale)).clip(0, 1)
 
 
@@ -194,32 +187,32 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
     if image is None:
         return read_projected(path, reading)[0]
     if image.shape[1:] != reading.sensor.shape:
-        size, expected = (
-            "x".join(map(str, shape)) for shape in (image.shape[1:], reading.sensor.shape)
-        )
+        size = "x".join(map(str, image.shape[1:]))
         raise InputError(
-            f"{path} is a range image of {size}, the sensor's is {expected}; give --size {size}, "
-            "or its points "
-            "(.bin, .ply, .pcd), which take any size."
+            f"{path} is a range image of {size}, sensor {reading.sensor}; give --size {size}, or "
+            "its points (.bin, .ply, .pcd), which take any size."
         )
     if len(image) < channels:
         raise _no_reflectance(path)
     image = image[:channels]
     if not reading.within_limits:
         return image
-    nearest, farthest = reading.sensor.min_range, reading.sensor.max_range
-    seen = (image[0] >= nearest) & (image[0] <= farthest)
+    r = image[0]
+    nearest = reading.sensor.min_range
+    farthest = reading.sensor.max_range
+    seen = (r >= nearest) & (r <= farthest)
     if not seen.any() and reading.on_bad_scan != "empty":
-        r = image[0][image[0] > 0]
-        ranges = f"; its ranges are {r.min():.4g} to {r.max():.4g}, in metres" if r.size else ""
-        raise NoPointsError(f"{path} has no return from {nearest:g} to {farthest:g} m{ranges}.")
+        raise NoPointsError(
+            f"{path} has no return from {nearest:g} to {farthest:g} m; its ranges are up to "
+            f"{r.max():.4g} m."
+        )
     image = np.where(seen, image, np.float32(0))
     highest = image[1:].max(initial=0)
-    check(
-        highest <= 1 + 1e-3,
-        f"{path}: reflectance of a range image lies in [0, 1], found up to {highest:.4g}; divide "
-        "by full reflectance.",
-    )
+    if highest > 1 + 1e-3:
+        raise InputError(
+            f"{path}: reflectance of a range image lies in [0, 1], found up to {highest:.4g}; "
+            "divide by full reflectance."
+        )
     image[1:] = image[1:].clip(0, 1)
     return image
 
@@ -262,9 +255,8 @@ def lacks_reflectance(
             else:
                 reflectance = image[1][image[0] > 0] if len(image) > 1 else None
         except InputError as error:
-            if on_bad_scan == "error" or (
-                on_bad_scan == "empty" and not isinstance(error, NoPointsError)
-            ):
+            usable = on_bad_scan == "empty" and isinstance(error, NoPointsError)
+            if on_bad_scan != "skip" and not usable:
                 raise
             continue
         if reflectance is None:

@@ -1,8 +1,8 @@
 """Fill in the defaults of a run's `data`, once."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
 
 from r2flow.data.opening import SOURCES, Described, Layout, Prepared
 from r2flow.data.options import (
@@ -19,9 +19,13 @@ from r2flow.errors import InputError
 from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
 from r2flow.registry import construct
 
+Options = TypeVar("Options", bound=SourceOptions)
+
 # Options that a kind of scans would ignore.
-IGNORED = dict.fromkeys((SIMULATED, PAIRS, MIXED), ("split", "drives")) | {
-    SIMULATED: ("root", "split", "drives")
+IGNORED = {
+    SIMULATED: ("root", "split", "drives"),
+    PAIRS: ("split", "drives"),
+    MIXED: ("split", "drives"),
 }
 
 
@@ -29,9 +33,9 @@ IGNORED = dict.fromkeys((SIMULATED, PAIRS, MIXED), ("split", "drives")) | {
 class DataPlan:
     """The sets of scans of a run, complete: each reading and sensor has all its options."""
 
-    sets: tuple[PartOptions, ...]  # to train on; empty for pairs
-    held_out: SourceOptions | None  # to validate on; None: a share of `sets`
-    scans: SourceOptions | None  # next to pairs
+    sets: Sequence[Described]  # to train on, with `PartOptions`; empty for pairs
+    held_out: Described | None  # to validate on; None: a share of `sets`
+    scans: Described | None  # next to pairs
 
 
 def plan_data(options: DataOptions, sensor: Sensor) -> DataPlan:
@@ -42,11 +46,8 @@ def plan_data(options: DataOptions, sensor: Sensor) -> DataPlan:
     Raises:
         InputError: an unknown data set or option, or one that would be ignored.
     """
-    _refuse_ignored("data", options.name, options)
-    usual = {
-        key: value for key, value in options.chosen.items() if key in ("projection", "convention")
-    }
-    sets: list[PartOptions] = []
+    _refuse_ignored("data", options)
+    sets: list[Described] = []
     if options.name == MIXED:
         sets = _parts(options, sensor)
     elif options.name != PAIRS:
@@ -59,32 +60,38 @@ def plan_data(options: DataOptions, sensor: Sensor) -> DataPlan:
         held_out = _held_out(options, options.validation.data, sensor)
     scans = None
     if options.scans is not None:
-        scans = _complete(
-            _checked_set("data.scans", SourceOptions, options.scans, options), usual, sensor
-        )
-    return DataPlan(tuple(sets), held_out, scans)
+        beside = _checked_set("data.scans", SourceOptions, options.scans, options)
+        scans = _complete(beside, _without_scale(options.chosen), sensor)
+    return DataPlan(sets, held_out, scans)
 
 
-def _complete(source: Any, usual: Mapping[str, Any], sensor: Sensor) -> Any:
+def _without_scale(reading: Data) -> Data:
+    """What a reading says of other files, too, with other columns and scale."""
+    own = ("columns", "reflectance_scale")
+    return {key: value for key, value in reading.items() if key not in own}
+
+
+def _complete(source: SourceOptions, usual: Data, sensor: Sensor) -> Described:
     """A set of scans with all fields of its reading: its own, else `usual`, else the defaults of
     its kind.
     """
-    own = build_sensor(**source.sensor) if getattr(source, "sensor", None) else sensor
-    reading: Data = {
+    if isinstance(source, PartOptions) and source.sensor:
+        sensor = build_sensor(**source.sensor)
+    scans = Described(source.name, source)
+    reading = {
         "projection": "spherical",
         "convention": "centre",
-        "columns": None,
         "on_bad_scan": "error",
+        "reflectance_scale": scans.scale(sensor.reflectance_scale),
+        **usual,
+        **source.chosen,
     }
-    scans = Described(source.name, source)
-    reading["reflectance_scale"] = scans.scale(own.reflectance_scale)
-    reading |= {**usual, **source.chosen}
     if scans.made_here:
         reading["reflectance_scale"] = 1.0
-    return replace(source, reading=ReadingOptions(**reading))
+    return scans.part(reading=ReadingOptions(**reading))
 
 
-def _parts(run: DataOptions, sensor: Sensor) -> list[PartOptions]:
+def _parts(run: DataOptions, sensor: Sensor) -> list[Described]:
     if not run.parts:
         example = (
             "[{name: kitti_360, root: FOLDER, weight: 3}, {name: folder, root: FOLDER, weight: 1}]"
@@ -95,32 +102,24 @@ def _parts(run: DataOptions, sensor: Sensor) -> list[PartOptions]:
         part = {"scenes": run.scenes, **given}
         if part.get("sensor") is not None:
             part["sensor"] = sensor_options(part["sensor"])
-        parts.append(
-            _complete(
-                _checked_set(f"data.parts[{number}]", PartOptions, part, run), run.chosen, sensor
-            )
-        )
+        parts.append(_checked_set(f"data.parts[{number}]", PartOptions, part, run))
     if len({part.weight is None for part in parts}) > 1:
         raise InputError("data.parts: give every part a weight, or none, for shares by size.")
-    return parts
+    return [_complete(part, run.chosen, sensor) for part in parts]
 
 
-def _held_out(run: DataOptions, other: Mapping[str, Any], sensor: Sensor) -> SourceOptions:
+def _held_out(run: DataOptions, other: Mapping[str, Any], sensor: Sensor) -> Described:
     held = {"name": run.name, "root": run.root, "split": None, "scenes": run.scenes, **other}
     usual = run.chosen
-    if held["name"] != run.name:  # other files, with other columns and scale
-        usual = {
-            key: value
-            for key, value in usual.items()
-            if key not in ("columns", "reflectance_scale")
-        }
+    if held["name"] != run.name:
+        usual = _without_scale(usual)
         held["root"] = other.get("root")
     return _complete(_checked_set("data.validation.data", SourceOptions, held, run), usual, sensor)
 
 
 def _checked_set(
-    what: str, kind: type[SourceOptions], options: Mapping[str, Any], run: DataOptions
-) -> Any:
+    what: str, kind: type[Options], options: Mapping[str, Any], run: DataOptions
+) -> Options:
     """One set of scans. Refuses a data set with a standard split of which no part is named."""
     source = construct(what, kind, options)
     if options.get("name") in (None, MIXED, PAIRS):
@@ -131,17 +130,17 @@ def _checked_set(
             f"{what}: {source.name} has a standard split: give split, one of {splits}, or null for "
             "all."
         )
-    _refuse_ignored(what, source.name, source)
+    _refuse_ignored(what, source)
     of_files = isinstance(SOURCES[source.name], Layout | Prepared)
     if of_files and options.get("scenes") not in (None, run.scenes):
         raise InputError(f"{what}.scenes does nothing for {source.name} scans: leave it out.")
     return source
 
 
-def _refuse_ignored(what: str, name: str, options: SourceOptions) -> None:
-    for key in IGNORED.get(name, ()):
+def _refuse_ignored(what: str, options: SourceOptions) -> None:
+    for key in IGNORED.get(options.name, ()):
         if getattr(options, key) is not None:
-            raise InputError(f"{what}.{key} does nothing for {name} scans: leave it out.")
+            raise InputError(f"{what}.{key} does nothing for {options.name} scans: leave it out.")
 
 
 def lacking_reflectance(sets: Sequence[Described]) -> str | None:
@@ -149,7 +148,7 @@ def lacking_reflectance(sets: Sequence[Described]) -> str | None:
     reflectance.
     """
     reasons = (one.kind.lacks_reflectance(one, one.options.chosen["on_bad_scan"]) for one in sets)
-    return next((reason for reason in reasons if reason), None)
+    return next(filter(None, reasons), None)
 
 
 def reflectance_levels(sets: Sequence[Described]) -> int | None:

@@ -1,21 +1,19 @@
 """A set of scans for commands and reports: numbered range images with their metadata."""
 
 import copy
-import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property, partial
 from typing import Any
 
-import numpy as np
-import torch
 from torch import Tensor
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, default_collate
 
-from r2flow.data.sources import ScanSource, spread
+from r2flow.data.sources import ScanSource, drives_within, spread
 from r2flow.lidar.sensors import Sensor
 from r2flow.noise import generator
 from r2flow.signals import blocking_signals, init_loader_worker
+from r2flow.store import checksum
 
 
 class ScanSet:
@@ -40,29 +38,18 @@ class ScanSet:
 
     def __getitem__(self, key: int | slice) -> Tensor:
         """One image, (2 or 1, H, W), or those of a slice, (n, 2 or 1, H, W)."""
-        numbers = range(len(self))[key]
-        return (
-            self.source.batch([*numbers])
-            if isinstance(numbers, range)
-            else self.source.batch([numbers])[0]
-        )
+        if isinstance(key, slice):
+            return self.source.batch(range(len(self))[key])
+        return self.source.batch([range(len(self))[key]])[0]
 
     def part(self, numbers: Sequence[int], name: str) -> "ScanSet":
         """Some of the scans, in the given order; `name` describes the selection."""
         part = copy.copy(self)
         part.source, part.about = self.source.subset(numbers), {**self.about, "part": name}
         if self.identity is not None:  # a part of a part differs from the same numbers of the whole
-            chosen = (
-                str(self.identity.get("part", "")).encode()
-                + np.asarray(numbers, dtype=np.int64).tobytes()
-            )
-            part.identity = {**self.identity, "part": hashlib.sha256(chosen).hexdigest()[:16]}
-        place = {number: i for i, number in enumerate(numbers)}
-        drives = {
-            drive: [place[n] for n in members if n in place]
-            for drive, members in self.drives.items()
-        }
-        part.drives = {drive: kept for drive, kept in drives.items() if kept}
+            chosen = [self.identity.get("part"), *numbers]
+            part.identity = {**self.identity, "part": checksum(chosen)[:16]}
+        part.drives = drives_within(self.drives, numbers)
         return part
 
     def limited(self, most: int | None) -> "ScanSet":
@@ -101,9 +88,8 @@ class ScanSet:
             return iter(loader)
 
 
-def _with_points(source: ScanSource, numbers: list[int]) -> tuple[Tensor, Tensor]:
-    images, points = zip(*(source.with_points(number) for number in numbers), strict=True)
-    return torch.from_numpy(np.stack(images)), torch.from_numpy(np.stack(points))
+def _with_points(source: ScanSource, numbers: list[int]) -> list[Tensor]:
+    return default_collate([source.with_points(number) for number in numbers])
 
 
 def fixed_choice(count: int, most: int) -> list[int]:

@@ -10,7 +10,9 @@ import shlex
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -118,18 +120,11 @@ def made_here(root: str | Path) -> bool:
     folder = given.parent if given.is_file() else given
     if not folder.is_dir() or manifest_of(folder):
         return folder.is_dir()
-    with os.scandir(
-        folder
-    ) as entries:  # knows folders without a system call per file; fails at a loop of links
-        listed = [
-            e
-            for e in entries
-            if scan_ending(e.name) or (os.path.isdir(e) if e.is_symlink() else e.is_dir())
-        ]
-    shown = (
-        e for e in listed if not e.name.startswith(".")
-    )  # not a disk's .Trash-1000, nor its lost+found
-    below = [e.path for e in shown if scan_ending(e.name) or os.access(e, os.X_OK)]
+    below = [
+        path
+        for path in folder.glob("[!.]*")  # not a disk's .Trash-1000, nor its lost+found
+        if scan_ending(path.name) or (path.is_dir() and os.access(path, os.X_OK))
+    ]
     return bool(below) and all(map(manifest_of, below))
 
 
@@ -152,23 +147,20 @@ def mismatch_of(paths: Sequence[str | Path], reading: Reading, ours: bool) -> Do
         for folder in sorted({os.path.dirname(path) for path in paths}):
             stored = Reading.stored(folder)
             theirs = stored.sensor if stored else sensor
-            differs = (
-                theirs.name != sensor.name
-                or sensor.name not in SENSORS
-                or theirs.shape[0] < sensor.shape[0]
-            )
-            if differs and not theirs.resized(*sensor.shape).same_image(sensor):
-                seen = f"{MANIFEST} names {theirs.name} {'x'.join(map(str, theirs.shape))}"
-                known = theirs.name in SENSORS
-                return Doubt(seen, theirs.name if known else None, sure=known)
+            known = theirs.name in SENSORS
+            if known and theirs.name == sensor.name and theirs.shape[0] >= sensor.shape[0]:
+                continue  # rows of rows are nearly the rows of the sensor
+            if not theirs.resized(*sensor.shape).same_image(sensor):
+                name = theirs.name if known else None
+                return Doubt(f"{MANIFEST} names {theirs}", name, sure=known)
         return None
-    scans = [
-        *readable([paths[number] for number in spread(len(paths), LOOKED_AT)], reading.columns)
-    ]
+    looked_at = [paths[number] for number in spread(len(paths), LOOKED_AT)]
+    scans = [*readable(looked_at, reading.columns)]
     mismatch = other_sensor(scans, reading.sensor) if scans else None
     if not scans or (mismatch and mismatch.hopeless):
         return mismatch
-    return None if warn_of_frame(paths[0], scans) and not (mismatch and mismatch.sure) else mismatch
+    unclear = warn_of_frame(paths[0], scans)
+    return None if unclear and not (mismatch and mismatch.sure) else mismatch
 
 
 def warn_of_frame(path: str | Path, scans: Sequence[Points]) -> bool:
@@ -176,11 +168,13 @@ def warn_of_frame(path: str | Path, scans: Sequence[Points]) -> bool:
 
     Warns of files of several turns, too.
     """
+    path = Path(path)
     if any(turns(scan) > SEVERAL for scan in scans):
-        warn_odd(Path(path), "a file holds several turns of the sensor; a scan is one: split it")
-    if unclear := is_unclear(scans):
+        warn_odd(path, "a file holds several turns of the sensor; a scan is one: split it")
+    unclear = is_unclear(scans)
+    if unclear:
         warn_odd(
-            Path(path),
+            path,
             "its beams are not clear: give scans of one sensor, in its own frame, not a vehicle's",
         )
     return unclear
@@ -211,6 +205,7 @@ def warn_of_other_sensor(
     )  # fmt: skip
 
 
+@dataclass(eq=False)
 class ScanFiles(ScanSource):
     """Scan files of any format and range images, read on access.
 
@@ -222,17 +217,12 @@ class ScanFiles(ScanSource):
 
     slow = True
 
-    def __init__(
-        self,
-        paths: Sequence[str | Path],
-        reading: Reading,
-        root: str | Path = "",
-        drives: Mapping[str, Sequence[int]] | None = None,
-        about: Mapping[str, Any] | None = None,
-    ) -> None:
-        self.paths, self.reading, self.root = list(paths), reading, root
-        self.drives, self.described = drives or {}, about or {}
-        self.bad: set[int] = set()
+    paths: Sequence[str | Path]
+    reading: Reading
+    root: str | Path = ""
+    drives: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    described: Mapping[str, Any] = field(default_factory=dict)  # part of `about`
+    bad: set[int] = field(default_factory=set, init=False)
 
     @property
     def names(self) -> list[str]:
@@ -240,9 +230,8 @@ class ScanFiles(ScanSource):
         return [str(path).removeprefix(below) for path in self.paths]
 
     def subset(self, indices: Sequence[int]) -> "ScanFiles":
-        return ScanFiles(
-            [self.paths[i] for i in indices], self.reading, self.root, about=self.described
-        )
+        paths = [self.paths[i] for i in indices]
+        return ScanFiles(paths, self.reading, self.root, described=self.described)
 
     def about(self) -> dict[str, Any]:
         return {
@@ -280,12 +269,10 @@ class ScanFiles(ScanSource):
         return hashlib.sha256(json.dumps([stats, hashes]).encode()).hexdigest()
 
     def places(self) -> set[str]:
-        parts = [os.path.split(path) for path in self.paths]
-        real = {
-            folder: os.path.realpath(folder) for folder in {folder for folder, _ in parts}
-        }  # slow on network disks
-        files = (os.path.join(real[folder], name) for folder, name in parts)
-        return {os.path.realpath(file) if os.path.islink(file) else file for file in files}
+        real = cache(os.path.realpath)  # slow on network disks
+        parts = map(os.path.split, self.paths)
+        files = (os.path.join(real(folder), name) for folder, name in parts)
+        return {real(file) if os.path.islink(file) else file for file in files}
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -304,7 +291,7 @@ class ScanFiles(ScanSource):
             )
             with leaving_out(advised):
                 return read(Path(self.paths[index]))
-        for candidate in ((index + i) % len(self) for i in range(len(self))):
+        for candidate in chain(range(index, len(self)), range(index)):
             if candidate in self.bad:
                 continue
             try:
@@ -336,15 +323,18 @@ class MadeScans(ScanSource):
         return part
 
 
+@dataclass(eq=False)
 class SimulatedScans(MadeScans):
     """Simulated scenes of one seed."""
 
-    slow, word, doing = True, "scene", "simulating"
+    slow = True
+    word = "scene"
+    doing = "simulating"
 
-    def __init__(
-        self, sensor: Sensor, seed: int, numbers: Sequence[int], reflectance: bool
-    ) -> None:
-        self.sensor, self.seed, self.numbers, self.reflectance = sensor, seed, numbers, reflectance
+    sensor: Sensor
+    seed: int
+    numbers: Sequence[int]
+    reflectance: bool
 
     def about(self) -> dict[str, Any]:
         return {
@@ -355,12 +345,9 @@ class SimulatedScans(MadeScans):
         }
 
     def identity(self) -> dict[str, Any]:
-        numbers = hashlib.sha256(np.asarray(self.numbers, dtype=np.int64).tobytes()).hexdigest()[
-            :16
-        ]
         return {
             **self.about(),
-            "numbers": numbers,
+            "numbers": checksum([*self.numbers])[:16],
             "simulator": simulator.REVISION,
             "sensor": self.sensor.described(),
         }
@@ -409,6 +396,15 @@ class InMemory(ScanSource):
 
     def __getitem__(self, index: int) -> np.ndarray:
         return self.images[index]
+
+
+def drives_within(
+    drives: Mapping[str, Sequence[Any]], chosen: Sequence[Any]
+) -> dict[str, list[int]]:
+    """The places of the chosen scans of each drive that has any, by the names or numbers of all."""
+    place = {scan: index for index, scan in enumerate(chosen)}
+    within = {name: [place[n] for n in scans if n in place] for name, scans in drives.items()}
+    return {name: places for name, places in within.items() if places}
 
 
 def spread(count: int, most: int) -> list[int]:

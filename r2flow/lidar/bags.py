@@ -75,8 +75,11 @@ def read_bag(
             for channel, recorded, stored in file.messages(chosen):
                 if channel.kind != _CLOUD:
                     continue
-                data = _decompressed(stored) if stored[:4] == _ZSTD else stored
-                message = deserialize[channel.encoding](data, "sensor_msgs/msg/PointCloud2")
+                if stored[:4] == _ZSTD:
+                    import zstandard  # of mcap
+
+                    stored = zstandard.decompress(stored)
+                message = deserialize[channel.encoding](stored, "sensor_msgs/msg/PointCloud2")
                 points: Points | InputError
                 try:
                     points = cloud_points(path, message, columns)
@@ -84,12 +87,6 @@ def read_bag(
                     points = InputError(f"{path} at {recorded}: {error}")
                 stamp = message.header.stamp
                 yield 10**9 * stamp.sec + stamp.nanosec or recorded, points
-
-
-def _decompressed(data: bytes) -> bytes:
-    import zstandard  # of mcap
-
-    return zstandard.decompress(data)
 
 
 def _files(path: Path) -> list[Path]:
@@ -112,26 +109,21 @@ def _open(path: Path) -> AbstractContextManager[Recording]:
 def _open_ros(path: Path) -> Iterator[Recording]:
     from rosbags import rosbag1, rosbag2
 
-    reader: Any
     ros1 = path.suffix.lower() == ".bag"
-    reader = rosbag1.Reader(path) if ros1 else rosbag2.Reader(path)
+    reader: Any = rosbag1.Reader(path) if ros1 else rosbag2.Reader(path)
+
+    def channel(connection: Any) -> Channel:
+        encoding = "ros1" if ros1 else connection.ext.serialization_format
+        return Channel(connection.topic, _short(connection.msgtype), encoding)
+
+    def messages(topic: str) -> Iterator[tuple[Channel, int, bytes]]:
+        wanted = [connection for connection in reader.connections if connection.topic == topic]
+        if wanted:  # rosbags takes none for all
+            for connection, recorded, data in reader.messages(connections=wanted):
+                yield channel(connection), recorded, data
+
     with reader:
-        channels = {
-            connection.id: Channel(
-                connection.topic,
-                _short(connection.msgtype),
-                "ros1" if ros1 else connection.ext.serialization_format,
-            )
-            for connection in reader.connections
-        }
-
-        def messages(topic: str) -> Iterator[tuple[Channel, int, bytes]]:
-            wanted = [connection for connection in reader.connections if connection.topic == topic]
-            if wanted:  # rosbags takes none for all
-                for connection, recorded, data in reader.messages(connections=wanted):
-                    yield channels[connection.id], recorded, data
-
-        yield Recording(set(channels.values()), messages)
+        yield Recording(set(map(channel, reader.connections)), messages)
 
 
 @contextmanager
@@ -153,13 +145,14 @@ def _open_mcap(path: Path) -> Iterator[Recording]:
                     yield _channel(channel, schema), message.log_time, message.data
 
         if summary is not None and indexed:
-            channels = {
-                _channel(channel, summary.schemas.get(channel.schema_id))
+            schemas = summary.schemas
+            channels = [
+                _channel(channel, schemas.get(channel.schema_id))
                 for channel in summary.channels.values()
-            }
+            ]
         else:
-            channels = {channel for channel, *_ in messages(None)}
-        yield Recording(channels, messages)
+            channels = [channel for channel, *_ in messages(None)]
+        yield Recording(set(channels), messages)
 
 
 @contextmanager
@@ -186,21 +179,17 @@ def _short(kind: str) -> str:
 
 def _choose(channels: Iterable[Channel], topic: str | None) -> str:
     """A topic of point clouds, or the only one."""
+    channels = sorted(set(channels))
     readable = sorted(
-        {
-            channel.topic
-            for channel in channels
-            if channel.kind == _CLOUD and channel.encoding in _ENCODINGS
-        }
+        {name for name, kind, encoding in channels if kind == _CLOUD and encoding in _ENCODINGS}
     )
-    if topic is None and len(readable) == 1:
-        return readable[0]
-    if topic is not None and topic in readable:
-        return topic
+    chosen = readable if topic is None else [name for name in readable if name == topic]
+    if len(chosen) == 1:
+        return chosen[0]
     if readable:
         raise InputError(f"give one of its topics of point clouds by --topic: {_join(readable)}.")
-    clouds = sorted(channel for channel in channels if "cloud" in channel.kind.lower())
-    found = clouds or sorted(channels)
+    clouds = [channel for channel in channels if "cloud" in channel.kind.lower()]
+    found = clouds or channels
     listed = _join([f"{name} ({kind}, encoding {encoding})" for name, kind, encoding in found])
     advice = ""
     if any("Compressed" in channel.kind for channel in clouds):

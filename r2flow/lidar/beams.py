@@ -7,7 +7,7 @@ from itertools import groupby
 
 import numpy as np
 from numpy import ndarray
-from scipy.ndimage import median
+from scipy.ndimage import fourier_gaussian, median
 
 from r2flow.errors import InputError
 from r2flow.lidar.scan_files import Points
@@ -72,9 +72,11 @@ def find_beams(*scans: Points) -> Beams:
     files = [scan.with_lost_rays() for scan in scans]
     beams = _beams_of_files(files)
     ends = np.cumsum([len(file.xyz) for file in files])
-    of_point = []
-    for row, file, scan in zip(np.split(beams.of_point[0], ends), files, scans, strict=False):
-        of_point.append(row if file is scan else row[scan.kept])
+    rows = np.split(beams.of_point[0], ends[:-1])
+    of_point = [
+        row if file is scan else row[scan.kept]
+        for row, file, scan in zip(rows, files, scans, strict=True)
+    ]
     return replace(beams, of_point=of_point)
 
 
@@ -124,11 +126,9 @@ def _is_scattered(scan: Points) -> bool:
     """Whether elevations are spread evenly within sectors of one degree of azimuth."""
     # The median gap between sorted elevations is 0.06 of the mean gap or less in real scans of any
     # order, ln 2 for points drawn at random, and 0.4 or more for scanners without beams.
-    elevation = elevations_of(scan.xyz)
-    seen = np.isfinite(elevation)
-    elevation = elevation[seen]
-    x, y, _ = scan.xyz[seen].T
-    sector = np.degrees(np.arctan2(y, x)).astype(int)
+    xyz = scan.xyz[np.isfinite(elevations_of(scan.xyz))]
+    elevation = elevations_of(xyz)
+    sector = np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])).astype(int)
     order = np.lexsort((elevation, sector))
     gaps = np.diff(elevation[order])[np.diff(sector[order]) == 0]
     crowded = len(sector) >= CROWDED * max(len(np.unique(sector)), 1)
@@ -147,7 +147,8 @@ def _beams_of_lasers(elevation: ndarray, lasers: Sequence[ndarray], order: str) 
             "LiDAR?"
         )
     middles = median(elevation, laser, names)
-    row = np.argsort(np.argsort(-middles, kind="stable"), kind="stable")
+    from_top = np.argsort(-middles, kind="stable")
+    row = np.argsort(from_top)
     table = np.full(highest + 2, -1)  # the last for laser -1
     table[names] = row
     firing = None
@@ -155,7 +156,7 @@ def _beams_of_lasers(elevation: ndarray, lasers: Sequence[ndarray], order: str) 
     whole = order != RING_AFTER_RING and len(names) == highest - first + 1
     if whole and len(set(np.diff(row))) > 1:  # not from the top or from the bottom
         firing = tuple(row.tolist())
-    return Beams(np.sort(middles)[::-1], [table[laser]], order, firing)
+    return Beams(middles[from_top], [table[laser]], order, firing)
 
 
 def _lasers_of_firings(elevations: list[ndarray]) -> int | None:
@@ -188,11 +189,9 @@ def _beams_of_elevations(elevation: ndarray) -> Beams | None:
     edges = np.arange(low - 3, high + 3 + BIN, BIN)
     size = 2 << len(edges).bit_length()  # the FFT of other sizes can be many times slower
     density = np.fft.rfft(np.histogram(seen, edges)[0], size)
-    frequency = np.fft.rfftfreq(size, BIN)
     peaks_of = []
     for bandwidth in BANDWIDTHS:
-        kernel = np.exp(-2 * (np.pi * bandwidth * frequency) ** 2)
-        smooth = np.fft.irfft(density * kernel)[: len(edges) - 1]
+        smooth = np.fft.irfft(fourier_gaussian(density, bandwidth / BIN, size))[: len(edges) - 1]
         peaks, _ = find_peaks(smooth)
         heights = smooth[peaks]
         # Returns from the vehicle itself have scattered elevations.

@@ -16,10 +16,7 @@ from r2flow.lidar.sensors import Sensor, build_sensor
 from r2flow.registry import (
     Bound,
     Registry,
-    UnknownName,
-    check_options,
     construct,
-    did_you_mean,
     options_of,
     presets,
 )
@@ -138,9 +135,8 @@ class Encoding:
 
     def described(self) -> dict[str, Any]:
         """All options but the sensor, as plain values."""
-        name = FORMATS.name_of(type(self.format))
         return {
-            "format": name,
+            "format": FORMATS.name_of(type(self.format)),
             "reflectance": self.reflectance,
             "limits": self.limits,
             "levels": self.levels,
@@ -211,9 +207,8 @@ class Encoding:
 
 def wrong_with(image: Tensor, far: float = FAR) -> str | None:
     """Problem of a range image, (2 or 1, H, W), with a hint; None if it is in metres and [0, 1]."""
-    low = image.amin((1, 2)).tolist()  # NaN if a channel contains NaN
-    high = image.amax((1, 2)).tolist()
-    for name, least, most in zip(("range", "reflectance"), low, high, strict=False):
+    for name, channel in zip(("range", "reflectance"), image, strict=False):
+        least, most = (end.item() for end in channel.aminmax())  # NaN if it contains NaN
         if not math.isfinite(least - most):
             return f"its {name} is NaN or infinite in places; 0 stands for a ray without a return"
         if least < 0:
@@ -221,14 +216,12 @@ def wrong_with(image: Tensor, far: float = FAR) -> str | None:
             if max(-least, most) <= 1:
                 hint = "is it in model space ([-1, 1])? Decode it"
             return f"its {name} goes down to {least:.4g}; {hint}"
-    if high[0] >= far:
-        median = image[0][image[0] > 0].median().item()
-        if median >= far:
+        if name == "reflectance" and most > FULL:
+            return (
+                f"its reflectance goes up to {most:.4g}, not 1; divide by its full scale, often 255"
+            )
+        if name == "range" and most >= far and (median := channel[channel > 0].median()) >= far:
             return f"its median range is {median:.4g} m; are these millimetres? Give metres"
-    if len(high) > 1 and high[1] > FULL:
-        return (
-            f"its reflectance goes up to {high[1]:.4g}, not 1; divide by its full scale, often 255"
-        )
     return None
 
 
@@ -275,20 +268,15 @@ def encoding_options(encoding: Encoding | str | Mapping[str, Any]) -> dict[str, 
     """
     if isinstance(encoding, Encoding):
         return encoding.described()
-    if not isinstance(encoding, str):
-        return {**options_of(Encoding, given=1), **encoding}
-    known = presets("encoding")
-    if encoding not in known:
-        hint = did_you_mean(encoding, known)
-        raise UnknownName(
-            f"no encoding named {encoding!r}; known: {', '.join(sorted(known))}.{hint}"
-        )
-    return {**options_of(Encoding, given=1), **known[encoding]}
+    if isinstance(encoding, str):
+        if encoding not in presets("encoding"):
+            Registry("encoding")[encoding]  # not known
+        encoding = presets("encoding")[encoding]
+    return {**options_of(Encoding, given=1), **encoding}
 
 
 def build_space(config: Mapping[str, Any]) -> ModelSpace:
     """The model space of a config with the keys `sensor` and `encoding`."""
     sensor = construct("sensor", build_sensor, config["sensor"])
-    check_options("encoding", Encoding, config["encoding"], given=1)
-    rays = sensor.rays(config["sensor"].get("rays", "centre"))
-    return ModelSpace(sensor, Encoding(sensor, **config["encoding"]), rays)
+    encoding = construct("encoding", Encoding, config["encoding"], sensor)
+    return ModelSpace(sensor, encoding, sensor.rays(config["sensor"].get("rays", "centre")))

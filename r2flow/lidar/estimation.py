@@ -79,9 +79,8 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
     except NoBeamsError as error:
         return Doubt(str(error), None, hopeless=True)
     except InputError:
-        own = np.asarray(whole.elevations)
-        nearest = own[np.searchsorted(-(own[:-1] + own[1:]) / 2, -elevation)]
-        off = np.median(abs(elevation - nearest))
+        nearest = np.searchsorted(-whole.row_edges[1:-1], -elevation)
+        off = np.median(abs(elevation - np.asarray(whole.elevations)[nearest]))
         fits = share >= IN_VIEW and off < MOST_OFF
         return None if fits else Doubt(f"{seen}, {off:.1f} degrees off its beams", None)
     name, near = nearest_sensor(beams)
@@ -93,7 +92,9 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
         most = 1 if built_in else rows // len(beams)
         tables = [(sensor.elevations[n // 2 :: n], n) for n in range(1, most + 1)]
         family = _family(sensor.name)
-        tables += [(SENSORS[other].elevations, 1) for other in SENSORS if _family(other) == family]
+        tables += [
+            (other.elevations, 1) for other in SENSORS.values() if _family(other.name) == family
+        ]
         distance, every = min((_distance(beams, table), n) for table, n in tables)
     if share < IN_VIEW or distance >= OFF or (distance > BEATEN and near < distance / 2):
         ends = f"{beams[0]:+.1f} to {beams[-1]:+.1f} degrees"
@@ -109,8 +110,8 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
     void = np.diff(filled) - 1
     if void.sum() - widest <= rows * MOST_VOID or rows > len(whole.elevations):
         return None
-    seen = f"{void.clip(0).sum()} of its {rows} rows lie between their beams and stay empty"
-    return Doubt(seen, None)
+    void = void.clip(0).sum()
+    return Doubt(f"{void} of its {rows} rows lie between their beams and stay empty", None)
 
 
 def is_tilted(scans: Sequence[Points]) -> bool:
@@ -127,14 +128,12 @@ def is_tilted(scans: Sequence[Points]) -> bool:
     elevation = 110 + elevations_of(xyz)
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
     ahead = np.stack([np.cos(azimuth), np.sin(azimuth)])
-    level = tilted = 0.0
+    clear = {}
     for tilt in product(TILTS, TILTS):
         count = np.bincount(((elevation - tilt @ ahead) / 0.05).astype(int))
-        clear = (np.convolve(count, np.ones(5)) ** 2).sum()
-        tilted = max(tilted, clear)
-        if max(map(abs, tilt)) <= LEVEL:
-            level = max(level, clear)
-    return bool(tilted > CLEARER * level)
+        clear[tilt] = (np.convolve(count, np.ones(5)) ** 2).sum()
+    level = max(value for tilt, value in clear.items() if max(map(abs, tilt)) <= LEVEL)
+    return bool(max(clear.values()) > CLEARER * level)
 
 
 def is_unclear(scans: Sequence[Points]) -> bool:
@@ -203,9 +202,8 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
         )
     beams = find_beams(*scans)
     steps = steps_of_a_turn(scans, beams.of_point)
-    elevations = (beams.elevations.astype(float).round(3) + 0.0).tolist()  # no -0.0
-    for row in range(1, len(elevations)):  # equal after rounding
-        elevations[row] = min(elevations[row], round(elevations[row - 1] - 1e-3, 3))
+    fall = 1e-3 * np.arange(len(beams.elevations))  # of rows that are equal after rounding
+    elevations = np.minimum.accumulate(beams.elevations.astype(float).round(3) + fall) - fall
     r = np.linalg.norm(xyz, axis=1)
     near, middle, far = np.quantile(r, [1e-4, 0.5, 1 - 1e-4])
     if middle > FARTHEST_RAY:
@@ -215,7 +213,7 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
     ground = _height(xyz)
     sensor = Sensor(
         name,
-        tuple(elevations),
+        tuple((elevations.round(3) + 0.0).tolist()),  # no -0.0
         max(int((steps + 0.5) // COLUMNS), 1) * COLUMNS,
         max(math.floor(near * 10) / 10, 0.1),
         float(math.ceil(far)),

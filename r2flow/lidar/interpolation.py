@@ -46,29 +46,23 @@ def _along(values: ndarray, known: ndarray, rule: Rule) -> tuple[ndarray, ndarra
     Values are (C, lines, positions).
     """
     count = known.shape[1]
-    last = count - 1
     at = np.arange(count)
-    lines = np.arange(len(known))[:, None]
     left, right = nearest_known(known)
     fillable = (left >= 0) & (right < count)
-    nearest = np.where(right - at < at - left, right, left).clip(0, last)
+    nearest = np.where(right - at < at - left, right, left).clip(0, count - 1)
     returned = known & (values[0] > 0)
-    low = nearest
-    high = nearest
+    filled = np.take_along_axis(values.astype(float), nearest[None], axis=2)
+    returns = fillable & (filled[0] > 0)
     if rule != "nearest":
-        a, b = nearest_known(returned)
-        low = np.where(a < 0, b, a).clip(0, last)
-        high = np.where(b >= count, a, b).clip(0, last)
-    share = np.where(high > low, (at - low) / np.maximum(high - low, 1), 0)
-    source = values.astype(float)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        if rule == "inverse":
-            source[0] = 1 / source[0]
-        filled = (1 - share) * source[:, lines, low] + share * source[:, lines, high]
-        if rule == "inverse":
-            filled[0] = 1 / filled[0]
-    filled = np.where(fillable & returned[lines, nearest], filled, 0)
-    return np.where(known, values, filled), known | fillable
+        for line in np.flatnonzero(returned.any(axis=1)):
+            places = np.flatnonzero(returned[line])
+            stored = values[:, line, places].astype(float)
+            if rule == "inverse":
+                stored[0] = 1 / stored[0]
+            filled[:, line] = [np.interp(at, places, channel) for channel in stored]
+            if rule == "inverse":
+                filled[0, line] = 1 / filled[0, line]
+    return np.where(known, values, np.where(returns, filled, 0)), known | fillable
 
 
 def nearest_known(known: ndarray) -> tuple[ndarray, ndarray]:

@@ -212,16 +212,15 @@ def image_to_points(
     if isinstance(rays, Sensor | str):
         rays = named_sensor(rays).rays()
     rays = torch.as_tensor(rays)
-    r = torch.from_numpy(np.nan_to_num(image[:1], posinf=0))[None]
-    xyz = unproject(r, rays)[0].numpy()
+    r = np.nan_to_num(image[:1], posinf=0)
+    xyz = unproject(torch.from_numpy(r)[None], rays)[0].numpy()
     if measured is not None:
         xyz = np.where(measured.any(axis=0), measured, xyz)
-    reflectance = image[1] if len(image) > 1 else np.zeros_like(image[0])
+    reflectance = image[1:] if len(image) > 1 else np.zeros_like(r)
     # By azimuth, not from the middle column: a ring of `reference` rays begins one column later.
     order = torch.argsort(rays[1, 0] % (2 * pi)).cpu().numpy()
-    returned = r[0, 0].numpy()[:, order] > 0
-    points = xyz[..., order][:, returned].T
-    return np.ascontiguousarray(points), reflectance[:, order][returned]
+    *axes, strength, r = np.concatenate([xyz, reflectance, r])[..., order]
+    return np.stack(axes, -1)[r > 0], strength[r > 0]
 
 
 def write_scan(image: ndarray, rays: Tensor, out: Path, name: str, endings: Sequence[str]) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from importlib.resources import files
 from itertools import pairwise
 from math import inf, pi
 from pathlib import Path
@@ -41,11 +42,10 @@ class Sensor:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "elevations", _plain(self.elevations))  # lists have no hash
-        rows = len(self.elevations)
-        order: Sequence[int] = range(rows)
         if self.firing is not None:
             object.__setattr__(self, "firing", _plain(self.firing))
-            order = self.firing
+        rows = len(self.elevations)
+        order = range(rows) if self.firing is None else self.firing
         scale = 1.0 if self.reflectance_scale is None else self.reflectance_scale
         inside = (90.0, *self.elevations, -90.0)
         rules = {
@@ -74,6 +74,10 @@ class Sensor:
     def shape(self) -> tuple[int, int]:
         """Image size (H, W)."""
         return len(self.elevations), self.columns
+
+    def __str__(self) -> str:
+        """Name and image size, as in messages."""
+        return f"{self.name} {len(self.elevations)}x{self.columns}"
 
     def same_image(self, other: "Sensor") -> bool:
         """Whether images of both have the same size, and elevations within 0.001 degrees."""
@@ -135,8 +139,7 @@ class Sensor:
             centre = (2 * beam + 1) * rows // (2 * old)
             middle = np.interp(np.arange(rows), centre, [above, *e, below])
         else:
-            share = np.linspace(0, old, rows + 1)
-            edges = np.interp(share, np.arange(old + 1), self.row_edges)
+            edges = np.interp(np.linspace(0, old, rows + 1), np.arange(old + 1), self.row_edges)
             middle = (edges[:-1] + edges[1:]) / 2
         return replace(sensor, elevations=tuple(middle.tolist()), firing=None)  # not one laser each
 
@@ -148,6 +151,13 @@ def _plain(values: Sequence[float] | ndarray) -> tuple:
 
 def _beams(top: float, step: float, count: int) -> tuple[float, ...]:
     return tuple(top - step * beam for beam in range(count))
+
+
+def _lasers(name: str) -> tuple[float, ...]:
+    """Measured elevations in degrees of a sensor's lasers, one a line of `lasers/NAME.txt`."""
+    file = files("r2flow.lidar") / "lasers" / f"{name}.txt"
+    lines = file.read_text(encoding="utf-8").splitlines()
+    return tuple(float(line) for line in lines if not line.startswith("#"))
 
 
 def _halves_in_turn(rows: int) -> tuple[int, ...]:
@@ -167,37 +177,6 @@ def _by_laser(elevations: Sequence[float]) -> dict[str, Any]:
     }
 
 
-# Median elevations of the 64 rings of an HDL-64E, measured on unfolded KITTI scans; another car's
-# are within 0.2 degrees. Rings are not evenly spaced, which matters for scan unfolding, where each
-# row is a ring.
-HDL64E_RINGS = (
-    2.45, 2.06, 1.80, 1.34, 1.06, 0.64, 0.37, 0.00, -0.34, -0.74, -1.02,
-    -1.35, -1.72, -2.05, -2.37, -2.71, -3.00, -3.36, -3.63, -3.99, -4.28, -4.61,
-    -4.95, -5.28, -5.63, -5.94, -6.24, -6.50, -6.87, -7.21, -7.45, -7.81, -8.41,
-    -8.93, -9.39, -9.77, -10.23, -10.83, -11.33, -11.75, -12.20, -12.63, -13.15, -13.67,
-    -14.24, -14.68, -15.17, -15.53, -16.14, -16.67, -17.22, -17.67, -18.18, -18.58, -19.03,
-    -19.57, -20.08, -20.67, -21.16, -21.56, -22.00, -22.64, -23.16, -23.64,
-)  # fmt: skip
-
-# VLP-32C User Manual 63-9325 (Velodyne), tables 9-2 and 9-6: elevation of laser 0, 1, ..., 31.
-VLP32C_LASERS = (
-    -25.0, -1.0, -1.667, -15.639, -11.31, 0.0, -0.667, -8.843, -7.254, 0.333, -0.333,
-    -6.148, -5.333, 1.333, 0.667, -4.0, -4.667, 1.667, 1.0, -3.667, -3.333, 3.333,
-    2.333, -2.667, -3.0, 7.0, 4.667, -2.333, -2.0, 15.0, 10.333, -1.333,
-)  # fmt: skip
-
-# Pandar64, from the correction table of the manufacturer's open driver (Hesai): elevation of
-# channel 1, 2, ..., 64 from the top. Calibration files of single units differ by some hundredths of
-# a degree.
-PANDAR64_CHANNELS = (
-    14.882, 11.032, 8.059, 5.057, 3.04, 2.028, 1.86, 1.688, 1.522, 1.351, 1.184,
-    1.013, 0.846, 0.675, 0.508, 0.337, 0.169, 0.0, -0.169, -0.337, -0.508, -0.675,
-    -0.845, -1.013, -1.184, -1.351, -1.522, -1.688, -1.86, -2.028, -2.198, -2.365, -2.536,
-    -2.7, -2.873, -3.04, -3.21, -3.375, -3.548, -3.712, -3.884, -4.05, -4.221, -4.385,
-    -4.558, -4.72, -4.892, -5.057, -5.229, -5.391, -5.565, -5.726, -5.898, -6.061, -7.063,
-    -8.059, -9.06, -9.885, -11.032, -12.006, -12.974, -13.93, -18.889, -24.897,
-)  # fmt: skip
-
 # Ranges and beams from the manuals: HDL-32E 63-9113, VLP-16 63-9243, VLP-32C 63-9325 (Velodyne);
 # OS1 datasheet of its first generation, whose 64 beams span +-16.6 degrees and whose 128 span
 # +-22.5 (Ouster); Pandar64 640-en (Hesai). OS1 beams are calibrated per unit and differ by up to
@@ -207,17 +186,17 @@ PANDAR64_CHANNELS = (
 SENSORS: Registry[Sensor] = Registry(
     "sensor",
     hdl64e=Sensor("hdl64e", _beams(3 - 7 / 32, 7 / 16, 64)),
-    hdl64e_rings=Sensor("hdl64e_rings", HDL64E_RINGS),
+    hdl64e_rings=Sensor("hdl64e_rings", _lasers("hdl64e_rings")),
     hdl32e=Sensor(
         "hdl32e", _beams(32 / 3, 4 / 3, 32), 1024, 1.0, 100.0, 1.84, firing=_halves_in_turn(32)
     ),
     vlp16=Sensor(
         "vlp16", _beams(15.0, 2.0, 16), min_range=0.5, max_range=100.0, firing=_halves_in_turn(16)
     ),
-    vlp32c=Sensor("vlp32c", **_by_laser(VLP32C_LASERS), min_range=0.5, max_range=200.0),
+    vlp32c=Sensor("vlp32c", **_by_laser(_lasers("vlp32c")), min_range=0.5, max_range=200.0),
     os1_64=Sensor("os1_64", _beams(16.6, 33.2 / 63, 64), min_range=0.8, max_range=120.0),
     os1_128=Sensor("os1_128", _beams(22.5, 45 / 127, 128), min_range=0.8, max_range=120.0),
-    pandar64=Sensor("pandar64", PANDAR64_CHANNELS, min_range=0.3, max_range=200.0),
+    pandar64=Sensor("pandar64", _lasers("pandar64"), min_range=0.3, max_range=200.0),
 )
 
 
@@ -255,30 +234,22 @@ def build_sensor(
     return replace(sensor.resized(rows, columns, rays), **given)  # type: ignore[arg-type]
 
 
-def read_sensor(path: str | Path, rows: int | None = None, columns: int | None = None) -> Sensor:
-    """Read a sensor from a YAML file with the options of `build_sensor`, in a size if given."""
+def read_sensor(path: str | Path) -> Sensor:
+    """Read a sensor from a YAML file with the options of `build_sensor`."""
     with reading(Path(path), 1 << 20, "sensor's YAML"):  # of a dozen lines
         options = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         if not isinstance(options, dict):
             raise InputError("it is not a sensor: give `name: mine`, `elevations: [15.0, ...]`.")
         if options.get("rays", "centre") != "centre":
             raise InputError("rays are a model's: give sensor.rays=reference in training.")
-        if rows is not None:
-            options["rows"] = rows
-        if columns is not None:
-            options["columns"] = columns
         return construct(str(path), build_sensor, options)
 
 
 def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> Sensor:
     """A sensor, given directly, by name or by YAML file, at an image size of (rows, columns)."""
-    rows, columns = size or (None, None)
-    if isinstance(sensor, Sensor):
-        return sensor.resized(rows, columns)
-    if str(sensor).lower().endswith(ENDINGS):
-        return read_sensor(sensor, rows, columns)
-    named = build_sensor(**sensor_options(sensor))
-    return named if size is None else named.resized(rows, columns)
+    if not isinstance(sensor, Sensor):
+        sensor = build_sensor(**sensor_options(sensor))
+    return sensor if size is None else sensor.resized(*size)
 
 
 def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
@@ -292,8 +263,7 @@ def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
 
 def options_of_sensor(sensor: Sensor) -> dict[str, Any]:
     """The keys of `sensor` in a config: the options of `build_sensor`."""
-    fields = asdict(sensor)
-    options = {key: np.asarray(value).tolist() for key, value in fields.items()}  # no NumPy numbers
+    options = {key: np.asarray(value).tolist() for key, value in asdict(sensor).items()}
     options |= {"rows": None, "rays": "centre"}
     if sensor.name in SENSORS:  # beams by the name
         options |= {"rows": len(sensor.elevations), "elevations": None}

@@ -211,9 +211,9 @@ def _without_return(azimuth: ndarray, steps: int) -> ndarray:
     three = gap + np.roll(gap, 1) + np.roll(gap, -1)
     missing = np.minimum(np.rint(gap / step) - 1, np.rint(three / step) - 3)
     missing = missing.clip(0).astype(int)
-    place = np.arange(missing.sum()) - np.repeat(np.cumsum(missing) - missing, missing) + 1
-    begin, gap, count = (np.repeat(values, missing) for values in (ordered, gap, missing))
-    return begin + gap * place / (count + 1)
+    place = np.cumsum([0, *missing + 1])  # of each return among all rays, and the turn's end
+    rays = np.interp(np.arange(place[-1]), place, [*ordered, ordered[0] + 2 * pi])
+    return np.delete(rays, place[:-1])
 
 
 def _blind(azimuth: ndarray, columns: int, steps: int) -> ndarray:

@@ -19,11 +19,12 @@ def turns(points: Points) -> float:
     if they are stored as they were fired, all beams at one azimuth after the other. Points stored
     ring after ring, without numbers, or in no order do not tell.
     """
-    xyz = points.xyz[(points.xyz[:, :2] != 0).any(axis=1)]
+    returned = points.xyz[:, :2].any(axis=1)
+    xyz = points.xyz[returned]
     if points.ring is None:
         return _by_order(xyz, _OF_ALL) if _fired_in_order(xyz) else 0.0
-    ring = points.ring[(points.xyz[:, :2] != 0).any(axis=1)]
-    fullest = np.bincount(ring).argmax() if len(ring) else 0
+    ring = points.ring[returned]
+    fullest = np.bincount(ring, minlength=1).argmax()
     return _by_order(xyz[ring == fullest], _OF_RING)
 
 

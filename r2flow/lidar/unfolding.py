@@ -134,8 +134,7 @@ def _starts(xyz: ndarray) -> ndarray:
 
     Before the first point is the last.
     """
-    x = xyz[:, 0]
-    y = xyz[:, 1]
+    x, y, _ = xyz.T
     return (x >= 0) & (y >= 0) & np.roll((x >= 0) & (y < 0), 1)
 
 
@@ -148,7 +147,7 @@ def _rows_from_field(xyz: ndarray, ring: ndarray, sensor: Sensor) -> ndarray:
     rows = sensor.shape[0]
     highest = int(ring.max(initial=0))
     elevation = _median_elevations(xyz, ring, max(highest + 1, rows + 1))
-    numbers = np.flatnonzero(np.bincount(ring))
+    numbers = np.unique(ring)
     first = 0
     if numbers[0] > 0 and highest <= rows:
         # Elevations decide if neither the first nor the last ring has a return.
@@ -228,11 +227,9 @@ def scatter_of(elevation: ndarray) -> tuple[ndarray, float]:
     returns from the vehicle itself. NaN is a ray without return.
     """
     middle = median_of_seen(elevation)
-    every = median_of_seen(elevation.reshape(-1, 1))
-    within, overall = (
-        median_of_seen(abs(elevation - about).reshape(-1, 1))[0] for about in (middle, every)
-    )
-    return middle, float(within) / float(overall) if overall > 0 else 1.0
+    within = np.nanmedian(abs(elevation - middle))
+    overall = np.nanmedian(abs(elevation - np.nanmedian(elevation)))
+    return middle, within / overall if overall > 0 else 1.0
 
 
 def median_of_seen(values: ndarray) -> ndarray:
@@ -256,12 +253,12 @@ def best_order(elevation: ndarray, sensor: Sensor) -> tuple[ndarray, bool]:
     orders = [top_down, top_down[::-1]]
     if sensor.firing is not None:
         orders.append(np.asarray(sensor.firing))
-    fits = []
+    misfits = []
     for order in orders:
         by_row = elevation[np.argsort(order)]
         seen = np.isfinite(by_row)
         apart = -np.diff(np.asarray(sensor.elevations)[seen])
         wrong = np.diff(by_row[seen]) > np.maximum(apart / 2, NOISE)
-        fits.append((-int(wrong.sum()), -_misfit(elevation, order, sensor)))
-    best = fits.index(max(fits))
-    return orders[best].astype(int), fits[best][0] == 0
+        misfits.append((wrong.sum(), _misfit(elevation, order, sensor)))
+    best = misfits.index(min(misfits))
+    return orders[best], misfits[best][0] == 0

@@ -173,7 +173,7 @@ def test_scans_that_are_trained_on_and_held_out_are_said(numbered: Path, tmp_pat
         root=str(numbered),
         validation={"data": {"name": "folder", "root": str(numbered)}},
     )
-    assert "data.validation.data holds 12 scans that are trained on" in caplog.text
+    assert "12 held-out scans are trained on" in caplog.text
     (tmp_path / "other" / "file.bin").symlink_to(numbered / "000002.bin")
     (tmp_path / "other" / "folder").symlink_to(numbered)
     module(
@@ -188,7 +188,7 @@ def test_scans_that_are_trained_on_and_held_out_are_said(numbered: Path, tmp_pat
         root=str(numbered),
         validation={"data": {"name": "folder", "root": str(tmp_path / "other")}},
     )
-    assert "holds 1 scans that are trained on" in caplog.messages[-1]
+    assert "1 held-out scans are trained on" in caplog.messages[-1]
 
 
 def test_a_part_that_trains_on_what_another_holds_out_is_said(
@@ -198,7 +198,7 @@ def test_a_part_that_trains_on_what_another_holds_out_is_said(
     parts = [{"name": "folder", "root": str(root)} for root in (numbered, tmp_path / "other")]
     for link, scan, said in (
         ("0", "000000", ""),
-        ("00", "000011", "held-out block of data.parts holds 1 scans that"),
+        ("00", "000011", "1 held-out scans are trained on"),
     ):
         (tmp_path / "other" / f"{link}.bin").symlink_to(numbered / f"{scan}.bin")
         module(name="mixed", parts=parts)

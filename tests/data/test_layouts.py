@@ -28,7 +28,7 @@ def test_drives_are_taken_by_number_and_by_name(kitti_360: Path):
     assert names(find_drives("kitti_360", kitti_360, drives=["2013_05_28_drive_0003_sync"])) == [
         "0003"
     ]
-    with pytest.raises(InputError, match=r"no drive named '7'; known: 2013_05_28_drive_0000_sync"):
+    with pytest.raises(InputError, match=r"no drives named '7'; known: 2013_05_28_drive_0000_sync"):
         find_drives("kitti_360", kitti_360, drives=[7])
 
 

@@ -17,7 +17,7 @@ from r2flow.errors import InputError
 from r2flow.lidar.labels import labels_beside
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.scan_files.pickled import MOST_STEPS, read_table
-from r2flow.lidar.sensors import PANDAR64_CHANNELS, SENSORS
+from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.view.panels import list_scans
 from tests.conftest import refused
 
@@ -89,7 +89,9 @@ def scanned(rocking: float, ahead: float) -> tuple[np.ndarray, np.ndarray, np.nd
     The vehicle drives a curve at a constant rate, and rocks by some degrees between its poses; the
     laser is mounted some metres further ahead.
     """
-    azimuth, elevation = np.meshgrid(np.linspace(3, -3.2, 120), np.deg2rad(PANDAR64_CHANNELS))
+    azimuth, elevation = np.meshgrid(
+        np.linspace(3, -3.2, 120), np.deg2rad(SENSORS["pandar64"].elevations)
+    )
     a, e = azimuth.ravel(), elevation.ravel()
     walls = 12 / (np.cos(e) * np.maximum(abs(np.cos(a)) / 3, abs(np.sin(a))))
     r = np.minimum(walls, 2 / np.sin(np.maximum(-e, 1e-3)))  # a street, 2 m below the laser

@@ -19,7 +19,7 @@ from r2flow.lidar.estimation import (
 )
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.scan_files import Points, read_points, write_points
-from r2flow.lidar.sensors import HDL64E_RINGS, SENSORS, Sensor
+from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.unfolding import elevations_of
 from r2flow.simulator import simulate
 
@@ -429,7 +429,12 @@ def test_sensors_of_one_s_own_are_judged_by_their_beams():
     assert other_sensor([few], SENSORS["vlp16"]) is None  # a few returns say nothing
     assert nearest_sensor(35 - 4 * np.arange(11.0))[0] is None  # six of these are beams of a VLP-16
     less = scan(
-        Sensor("less", tuple(np.delete(HDL64E_RINGS, [n for n in range(32, 64) if n % 4]))),
+        Sensor(
+            "less",
+            tuple(
+                np.delete(SENSORS["hdl64e_rings"].elevations, [n for n in range(32, 64) if n % 4])
+            ),
+        ),
         RING_AFTER_RING,
     )
     assert "21 of its 64 rows lie between" in other_sensor([less], SENSORS["hdl64e_rings"]).seen

@@ -8,7 +8,14 @@ import yaml
 
 from r2flow.lidar.encoding import build_space
 from r2flow.lidar.projection import image_to_points, project
-from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor, read_sensor, write_sensor
+from r2flow.lidar.sensors import (
+    SENSORS,
+    Sensor,
+    build_sensor,
+    named_sensor,
+    read_sensor,
+    write_sensor,
+)
 from tests.conftest import refused
 
 CONF = Path(__file__).resolve().parents[2] / "conf" / "sensor"
@@ -155,7 +162,7 @@ def test_a_written_sensor_is_read_back(sensor, tmp_path):
     )
     write_sensor(mine, tmp_path / "mine.yaml", "two\nlines")
     assert read_sensor(tmp_path / "mine.yaml") in {mine}  # equal, with a hash
-    assert read_sensor(tmp_path / "mine.yaml", 8, 64) == mine.resized(8, 64)
+    assert named_sensor(str(tmp_path / "mine.yaml"), (8, 64)) == mine.resized(8, 64)
 
 
 def test_a_sensor_of_one_s_own_has_every_option(tmp_path):

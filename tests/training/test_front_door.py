@@ -166,7 +166,7 @@ def test_scans_in_files_take_the_place_of_an_experiments_simulated_scenes(
     asked[1:3] = []
     assert 99 not in {
         part.options.scenes
-        for part in build(compose([*asked, "data.scenes=99"]), asked).data.described_sets
+        for part in build(compose([*asked, "data.scenes=99"]), asked).data.plan.sets
     }
 
 

@@ -90,13 +90,9 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
     check_columns(columns)
     ending = scan_ending(path.name)
     if not ending and path.exists():
-        advice = (
-            f"has no ending of a scan file; known: {', '.join(SCAN_ENDINGS)}. Convert or rename it"
-        )
-        for other, conversion in ELSEWHERE.items():
-            if path.name.lower().endswith(other):
-                advice = conversion.format(path=path)
-        raise InputError(f"{path} {advice}.")
+        known = ", ".join(SCAN_ENDINGS)
+        other = f"has no ending of a scan file; known: {known}. Convert or rename it"
+        raise InputError(f"{path} {conversion_of(path) or other}.")
     raw = ending in _ROWS
     with reading(path, LARGEST_FILE, "scan file", least=0 if raw else 1):
         if raw:
@@ -130,12 +126,21 @@ def _tell_dropped(path: Path, points: Points) -> Points:
     return points
 
 
+def conversion_of(path: str | Path) -> str | None:
+    """Advice on how a file of a format that is not read becomes scans; None for other files."""
+    for endings, advice in ELSEWHERE.items():
+        if str(path).lower().endswith(endings):
+            return advice.format(path=path)
+    return None
+
+
 def points_beside(path: Path) -> Path:
     """The file of points next to a range image of the same name, if there is one; else the path."""
-    if path.suffix.lower() != ".npy":
-        return path
-    others = (path.with_suffix(ending) for ending in WRITTEN if ending != ".npy")
-    return next((other for other in others if other.is_file()), path)
+    if path.suffix.lower() == ".npy":
+        for ending in (".bin", ".pcd", ".ply"):
+            if path.with_suffix(ending).is_file():
+                return path.with_suffix(ending)
+    return path
 
 
 def read_range_image(path: str | Path) -> ndarray | None:
@@ -145,10 +150,12 @@ def read_range_image(path: str | Path) -> ndarray | None:
     Values that are not finite become 0, a ray without return; so do, with a warning, ranges that no
     LiDAR measures.
     """
-    if Path(path).suffix.lower() == ".pth":
-        with reading(Path(path), LARGEST_FILE, "sample"):
-            array = samples.read_image(Path(path))
-    elif Path(path).suffix.lower() == ".npy":
+    path = Path(path)
+    ending = path.suffix.lower()
+    if ending == ".pth":
+        with reading(path, LARGEST_FILE, "sample"):
+            array = samples.read_image(path)
+    elif ending == ".npy":
         array = read_numbers(path)
     else:
         return None
@@ -161,18 +168,19 @@ def read_range_image(path: str | Path) -> ndarray | None:
         image = np.nan_to_num(array.astype(np.float32), copy=False, posinf=0, neginf=0)
     ranges = image[0]
     wrong = (ranges < 0) | (ranges > FARTHEST_RAY)
-    if 2 * wrong.sum() > np.count_nonzero(ranges):
+    count = int(np.count_nonzero(wrong))
+    if 2 * count > np.count_nonzero(ranges):
         found = ranges[wrong]
         raise InputError(
             f"{path}: most of its ranges are below 0 or above {FARTHEST_RAY:g} m, from "
             f"{found.min():.3g} to {found.max():.3g}. Are these millimetres, or a scan in model "
             "space? Give metres."
         )
-    if wrong.any():
+    if count:
         kind = (
             f"ranges below 0 or above {FARTHEST_RAY:g} m are taken as no return; ranges are metres"
         )
-        warn_odd(Path(path), kind, int(wrong.sum()))
+        warn_odd(path, kind, count)
         image[:, wrong] = 0
     return image
 
@@ -200,8 +208,7 @@ def write_points(
     if not writable or (ending == ".bin" and reflectance is None):
         formats = ", ".join(WRITTEN)
         raise InputError(f"{path}: scans are written as {formats}; .bin only with a reflectance.")
-    x, y, z = xyz.T
-    columns = {"x": x, "y": y, "z": z}
+    columns = dict(zip("xyz", xyz.T, strict=True))
     if reflectance is not None:
         columns["intensity"] = reflectance
     if ring is not None:

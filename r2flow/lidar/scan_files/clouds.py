@@ -34,7 +34,7 @@ def read_pcd(path: Path) -> Table:
     """
     text, body = _split_header(path.read_bytes())
     header = {line.split()[0]: line.split()[1:] for line in text.splitlines() if line.strip()}
-    declared = header["FIELDS"] if "FIELDS" in header else header["COLUMNS"]
+    declared = header.get("FIELDS") or header["COLUMNS"]
     counts = map(int, header.get("COUNT", ["1"] * len(declared)))
     names: list[str] = []
     kinds: list[tuple[str, str, tuple[int, ...]]] = []
@@ -46,7 +46,7 @@ def read_pcd(path: Path) -> Table:
             kinds.append((number, f"<{kind.lower()}{size}", (width,) if width > 1 else ()))
             names.append(name)
     row = np.dtype(kinds)
-    sizes = header["POINTS"] if "POINTS" in header else header["WIDTH"] + header["HEIGHT"]
+    sizes = header.get("POINTS") or header["WIDTH"] + header["HEIGHT"]
     count = math.prod(map(int, sizes))
     encoding = header["DATA"][0]
     if encoding != "binary_compressed":
@@ -114,12 +114,12 @@ def _columns(
     body: bytes, row: np.dtype, count: int, encoding: str, last: bool = True
 ) -> list[ndarray]:
     """The columns of `count` rows, text or binary; `last`: nothing may follow them."""
-    table = np.empty(0, row)
     if encoding == "ascii":
         lines = [line for line in body.decode("ascii").splitlines() if line.strip()]
         more = len(lines) > count
-        if lines:
-            table = np.loadtxt(lines[:count], row, comments=None, ndmin=1)
+        table = (
+            np.loadtxt(lines[:count], row, comments=None, ndmin=1) if lines else np.empty(0, row)
+        )
     else:
         more = body[count * row.itemsize :].strip(b"\0\r\n ") != b""  # pages are padded
         table = np.frombuffer(body, row, count)

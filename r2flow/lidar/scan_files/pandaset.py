@@ -15,7 +15,7 @@ from r2flow.errors import InputError, check
 from r2flow.files import read_json
 from r2flow.lidar.scan_files.clouds import Table
 from r2flow.lidar.scan_files.pickled import column, read_table
-from r2flow.lidar.sensors import PANDAR64_CHANNELS
+from r2flow.lidar.sensors import SENSORS
 
 # The laser in the vehicle's frame (x right, y ahead, z up): metres, and radians about x and y.
 # Medians of fits to 20 frames of drive 002, with one position each: 18 agree to 3 mm, all to 11.
@@ -119,7 +119,7 @@ def _aligned(xyz: ndarray, times: ndarray) -> ndarray:
     from 1 to 0.005 degrees. Beams that are less than 2 s apart, which could be mistaken for each
     other, wait for a smaller s.
     """
-    beams = np.radians(np.sort(PANDAR64_CHANNELS))
+    beams = np.radians(np.sort(SENSORS["pandar64"].elevations))
     between = (beams[1:] + beams[:-1]) / 2
     gaps = np.pad(np.diff(beams), 1, constant_values=np.inf)
     apart = np.minimum(gaps[1:], gaps[:-1])

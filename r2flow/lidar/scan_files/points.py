@@ -95,13 +95,12 @@ def check_columns(columns: Sequence[str] | None) -> None:
                 f"intensities=reflectance,channel=_; found {','.join(names)[:80]}."
             )
         return
-    for role, aliases in ROLES.items():
-        count = sum(name in aliases for name in names)
-        if count > 1 or (count == 0 and role in "xyz"):
-            raise InputError(
-                "columns must name x, y and z, and intensity and ring at most once, as "
-                f"x,y,z,intensity,_; found {','.join(names)[:80]}."
-            )
+    roles = [role for role in map(role_of, names) if role]
+    if len(set(roles)) < len(roles) or not set("xyz").issubset(roles):
+        raise InputError(
+            "columns must name x, y and z, and intensity and ring at most once, as "
+            f"x,y,z,intensity,_; found {','.join(names)[:80]}."
+        )
 
 
 def renamed(names: Sequence[str], columns: Sequence[str] | None) -> list[str]:
@@ -120,28 +119,15 @@ def renamed(names: Sequence[str], columns: Sequence[str] | None) -> list[str]:
     pairs = [str(name).rpartition("=") for name in columns]
     given = {_plain(field.strip()): role.strip() for field, _, role in pairs}
     plain = [_plain(name) for name in names]
-    missing = [field for field in given if field not in plain]
-    if missing:
-        raise InputError(f"it has no field {', '.join(missing)}; it has: {_listed(names)}.")
+    _refuse_missing([field for field in given if field not in plain], names)
     taken = {role_of(role) for role in given.values()} - {None}
     return [given.get(name, "_" if role_of(name) in taken else name) for name in plain]
 
 
-def _listed(names: Sequence[str]) -> str:
-    return " ".join(", ".join(names)[:120].split()) or "none"
-
-
-def find_roles(names: Sequence[str]) -> dict[str, list[int]]:
-    """Indices of the candidate columns of x, y, z, reflectance and ring, in order of preference."""
-    lower = [_plain(name) for name in names]
-    roles = {
-        role: [lower.index(alias) for alias in aliases if alias in lower]
-        for role, aliases in ROLES.items()
-    }
-    missing = [role for role in "xyz" if not roles[role]]
+def _refuse_missing(missing: Sequence[str], names: Sequence[str]) -> None:
     if missing:
-        raise InputError(f"it has no field {', '.join(missing)}; it has: {_listed(names)}.")
-    return roles
+        listed = " ".join(", ".join(names)[:120].split()) or "none"
+        raise InputError(f"it has no field {', '.join(missing)}; it has: {listed}.")
 
 
 def column_points(names: Sequence[str], columns: Sequence[ndarray], raw: bool = False) -> Points:
@@ -155,13 +141,15 @@ def column_points(names: Sequence[str], columns: Sequence[ndarray], raw: bool = 
         NoPointsError: There are no points, or only rays without return.
         InputError: The columns hold no numbers, or numbers that are no scan.
     """
+    plain = [_plain(name) for name in names]
     roles = {
-        role: [columns[index] for index in indices] for role, indices in find_roles(names).items()
+        role: [columns[plain.index(alias)] for alias in aliases if alias in plain]
+        for role, aliases in ROLES.items()
     }
+    _refuse_missing([role for role in "xyz" if not roles[role]], names)
     for column in chain(*roles.values()):
         if column.ndim != 1 or column.dtype.kind not in "fiub":
             raise InputError(f"it holds {column.dtype} in the place of one number a point.")
-    rows = len(roles["x"][0])
     reflectance = None
     with np.errstate(over="ignore", invalid="ignore"):  # float32 overflow is infinite: dropped
         axes = np.array([roles[axis][0] for axis in "xyz"], dtype=np.float32)
@@ -174,14 +162,13 @@ def column_points(names: Sequence[str], columns: Sequence[ndarray], raw: bool = 
             finite &= np.isfinite(reflectance)
     _check_values(size, reflectance, finite, raw)
     kept = np.flatnonzero(finite & (size <= FARTHEST))
-    whole = len(kept) == rows
-    selected = slice(None) if whole else kept
+    dropped = len(size) - len(kept)
     return Points(
-        np.ascontiguousarray(axes.T[selected]),
-        None if reflectance is None else reflectance[selected],
-        _ring_numbers(roles["ring"][0][selected]) if roles["ring"] else None,
-        rows - len(kept),
-        None if whole else kept,
+        np.ascontiguousarray(axes.T[kept]),
+        None if reflectance is None else reflectance[kept],
+        _ring_numbers(roles["ring"][0][kept]) if roles["ring"] else None,
+        dropped,
+        kept if dropped else None,
     )
 
 

@@ -31,20 +31,19 @@ def read_rows(path: Path, columns: Sequence[str] | None) -> list[ndarray]:
     values = np.fromfile(path, "<f4")
     if values[:1].tobytes() == np.lib.format.MAGIC_PREFIX[:4]:
         raise InputError("it is a .npy file: rename it.")
-    whole = size % (4 * width) == 0
-    if whole and (columns or fits_width(values, width)):
-        return list(values.reshape(-1, width).T)
-    fitting = fitting_widths(values)
-    if len(fitting) == 1 and fitting != [width]:
-        names = ["x", "y", "z", "intensity", *"_" * WIDEST][: fitting[0]]
+    left = size % (4 * width)
+    if left or not (columns or fits_width(values, width)):
+        fitting = fitting_widths(values)
+        if len(fitting) == 1 and fitting != [width]:
+            names = ["x", "y", "z", "intensity", *"_" * WIDEST][: fitting[0]]
+            raise InputError(
+                f"it is made of rows of {fitting[0]} float32, not {width}: name all by --columns "
+                f"{','.join(names)} (_ for what is not used)."
+            )
+    if left:
         raise InputError(
-            f"it is made of rows of {fitting[0]} float32, not {width}: name all by --columns "
-            f"{','.join(names)} (_ for what is not used)."
-        )
-    if not whole:
-        raise InputError(
-            f"it is not made of rows of {width} float32: {size % (4 * width)} bytes are left. Is "
-            "it cut short, or of other columns (--columns x,y,z,intensity,ring)?"
+            f"it is not made of rows of {width} float32: {left} bytes are left. Is it cut short, "
+            "or of other columns (--columns x,y,z,intensity,ring)?"
         )
     return list(values.reshape(-1, width).T)
 

@@ -31,11 +31,9 @@ def fits_width(values: ndarray, width: int) -> bool:
         return False
     table = values[: rows * width].reshape(rows, width)
     first = np.random.default_rng(0).integers(rows - 1, size=PAIRS)
-    pairs = table[first[:, None] + (0, 1), :2]
-    with np.errstate(invalid="ignore"):
-        returned = np.isfinite(pairs).all(axis=2) & pairs.any(axis=2)
-    x, y = pairs[returned.all(axis=1)].astype(float).T
-    if not x.size:
-        return False
-    turned = np.diff(np.rad2deg(np.arctan2(y, x)), axis=0)
-    return bool(np.quantile(abs((turned + 180) % 360 - 180), MOST) < TURNED)
+    with np.errstate(all="ignore"):  # of rays without return, and of numbers that are no points
+        direction = table[:, 0].astype(complex) + 1j * table[:, 1]
+        direction /= abs(direction)
+        turned = np.angle(direction[first + 1] / direction[first], deg=True)
+    known = abs(turned[np.isfinite(turned)])
+    return known.size > 0 and bool(np.quantile(known, MOST) < TURNED)
