@@ -17,9 +17,8 @@ def prepare_process() -> None:
     the next one. Here blocks of up to 1 GiB come from the heap, which keeps up to 2 GiB. The user's
     settings (MALLOC_MMAP_..., MALLOC_TRIM_..., GOMP_SPINCOUNT) take precedence.
     """
-    os.environ["MPLBACKEND"] = (
-        "agg"  # a notebook's shell has the notebook's, which may not be installed here
-    )
+    # a notebook's shell has the notebook's, which may not be installed here
+    os.environ["MPLBACKEND"] = "agg"
     # 1.4 to 2.5 times faster next to other programs
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     if any(name.startswith(("MALLOC_MMAP_", "MALLOC_TRIM_")) for name in os.environ):

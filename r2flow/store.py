@@ -269,7 +269,8 @@ def read_manifest(folder: Path, kind: str | None = None) -> Config:
         content: Config = read_json(path)
         if "checksum" not in content:  # a common name: of a data set, say
             raise _Foreign(f"{path} is damaged, or not of r2flow: give another folder.")
-        format_name, _ = content["format"], content["recipe"]
+        format_name = content["format"]
+        _ = content["recipe"]
         damaged = content.pop("checksum") != checksum(content)
     except (OSError, _Foreign):
         raise

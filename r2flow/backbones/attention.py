@@ -24,9 +24,8 @@ from r2flow.backbones.layers import rows_at_once
 from r2flow.errors import InputError
 from r2flow.registry import Registry
 
-_GRAPHS = (
-    64  # limit of torch.compile's graphs of flex_attention; three levels exceed its default of 8
-)
+# limit of torch.compile's graphs of flex_attention; three levels exceed its default of 8
+_GRAPHS = 64
 # Queries, with 6 x 16 keys: smaller tiles copy more keys, larger tiles compute more masked
 # products.
 _TILE = (4, 8)

@@ -152,7 +152,6 @@ def view(
     print(path)
     screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if out is None and (screen or not sys.platform.startswith("linux")):
-        with suppress(
-            webbrowser.Error
-        ):  # without a screen, a text browser would block the terminal
+        # without a screen, a text browser would block the terminal
+        with suppress(webbrowser.Error):
             webbrowser.open(path.resolve().as_uri())

@@ -15,9 +15,8 @@ class Augmentation:
     image's noise and time.
     """
 
-    flip: bool = (
-        False  # mirror half of the images: azimuth -> -azimuth; exact, as the bins are symmetric
-    )
+    # mirror half of the images: azimuth -> -azimuth; exact, as the bins are symmetric
+    flip: bool = False
     # rotate about the sensor by a whole number of columns, drawn uniformly; exact on the ring
     roll: bool = False
 
@@ -27,7 +26,8 @@ class Augmentation:
     def __call__(self, image: np.ndarray, seed: int, k: int) -> np.ndarray:
         """Augment image k of a run, (2 or 1, H, W), metres and reflectance."""
         draw = noise.generator(seed, "augmentation", k)
-        mirrored, turn = draw.random() < 0.5, int(draw.integers(image.shape[-1]))
+        mirrored = draw.random() < 0.5
+        turn = int(draw.integers(image.shape[-1]))
         if self.flip and mirrored:
             image = image[..., ::-1]
         if self.roll:

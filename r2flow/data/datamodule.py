@@ -95,9 +95,8 @@ class ScanDataModule(L.LightningDataModule):
         self.training_source: Scans | None = None
         self.validation_source: Scans | None = None
         self.scans: Mixture | None = None  # next to pairs
-        self.save_hyperparameters(
-            self.described(), logger=False
-        )  # the module logs those that they share
+        # the module logs those that they share
+        self.save_hyperparameters(self.described(), logger=False)
 
     def described(self) -> dict[str, Any]:
         """The arguments of this DataModule, complete, as plain values."""
@@ -155,9 +154,8 @@ class ScanDataModule(L.LightningDataModule):
         self.options = replace(
             self.options, root=self.options.root or parent["pairs"], pairs=self.pairs
         )
-        self.save_hyperparameters(
-            self.described(), logger=False
-        )  # the module logs those that they share
+        # the module logs those that they share
+        self.save_hyperparameters(self.described(), logger=False)
 
     @property
     def pair_store(self) -> PairStore:
@@ -175,9 +173,8 @@ class ScanDataModule(L.LightningDataModule):
             self.adopt(wanted)
         if self.pairs is None and self.training_source is None:
             self.training_source, self.validation_source = self.opened = self._open_all()
-            self._order(
-                self.training_source
-            )  # refuses wrong weights before anything is read or written
+            # refuses wrong weights before anything is read or written
+            self._order(self.training_source)
         elif self.plan.scans is not None and self.scans is None:
             self.scans = Mixture([self._open(self.plan.scans)])
             self.names = list(self.scans.names)
@@ -333,7 +330,8 @@ class ScanDataModule(L.LightningDataModule):
         Raises:
             InputError: the batch cannot be shared by the devices and accumulated parts.
         """
-        ranks, parts = trainer.world_size, trainer.accumulate_grad_batches
+        ranks = trainer.world_size
+        parts = trainer.accumulate_grad_batches
         if self.batch_size % (ranks * parts):
             raise InputError(
                 f"data.batch_size={self.batch_size} cannot be shared by {ranks} devices times "
@@ -389,7 +387,8 @@ class ScanDataModule(L.LightningDataModule):
         # All ranks need the same number of batches, or they would wait for each other: with fewer
         # scans than ranks, every rank takes all scans; otherwise the remainder is left out.
         if len(source) < ranks:
-            rank, ranks = 0, 1
+            rank = 0
+            ranks = 1
         count = len(source) - len(source) % ranks
         sampler = RunSampler(range(len(source)), count, rank, ranks, lambda: (0, 0))
         return self._loader(self._dataset(source, "validation", whole), sampler, batch_size)

@@ -56,17 +56,15 @@ class Drive:
     """One recording: consecutive scans."""
 
     name: str  # its name in `data.drives`
-    scans: tuple[
-        str, ...
-    ]  # paths as strings: 100,000 Path objects take seconds and ten times the memory
+    # paths as strings: 100,000 Path objects take seconds and ten times the memory
+    scans: tuple[str, ...]
 
 
 class SourceKind(ABC):
     """A kind of scans, an entry of `SOURCES`: `data=NAME` in a run, `NAME:ROOT` in a command."""
 
-    splits: Mapping[
-        str, Sequence[int | str]
-    ] = {}  # standard split: names or numbers of each part's drives
+    # standard split: names or numbers of each part's drives
+    splits: Mapping[str, Sequence[int | str]] = {}
     sensor = "hdl64e"  # name of the default sensor
     reflectance_scale = 1.0  # default value of full reflectance
     levels: int | None = None  # reflectance is n / levels
@@ -117,9 +115,8 @@ class SourceKind(ABC):
 class Layout(SourceKind):
     """A data set of scan files; `find` lists its drives below a folder, in order."""
 
-    find: Callable[
-        [Path], list[Drive]
-    ]  # the first line of its docstring is the pattern of its files
+    # the first line of its docstring is the pattern of its files
+    find: Callable[[Path], list[Drive]]
     splits: Mapping[str, Sequence[int | str]] = field(default_factory=dict)
     sensor: str = "hdl64e"
     reflectance_scale: float = 1.0
@@ -127,7 +124,9 @@ class Layout(SourceKind):
 
     def find_drives(self, options: SourceOptions) -> list[Drive]:
         """The drives of the split and the names in `options`, without empty drives."""
-        name, split, root = options.name, options.split, options.folder
+        name = options.name
+        split = options.split
+        root = options.folder
         self.chosen([], split, None)  # refuses an unknown split before any search
         if not root.is_dir():
             raise InputError(

@@ -19,12 +19,10 @@ from r2flow.lidar.sensors import Sensor
 from r2flow.processes import rank_and_world_size
 
 Item = dict[str, Tensor]
-Further = Callable[
-    [Tensor, Sensor, np.random.Generator], Item
-]  # of x_1, (C, H, W), its sensor, the image's draws
-Key = (
-    int | tuple[int, int]
-)  # of an item: the number k of the image in the run, and that of the scan; or both in one
+# of x_1, (C, H, W), its sensor, the image's draws
+Further = Callable[[Tensor, Sensor, np.random.Generator], Item]
+# of an item: the number k of the image in the run, and that of the scan; or both in one
+Key = int | tuple[int, int]
 
 
 class ItemFormat(NamedTuple):

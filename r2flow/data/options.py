@@ -14,15 +14,13 @@ from r2flow.lidar.scan_files import check_columns
 from r2flow.registry import Count, Natural, NonNegative, Portion, Positive, Seed, strict
 from r2flow.samplers import build_sampler
 
-SIMULATED, PREPARED, FOLDER = (
-    "simulated",
-    "prepared",
-    "folder",
-)  # names in `r2flow.data.opening.SOURCES`
-MIXED, PAIRS = (
-    "mixed",
-    "pairs",
-)  # other values of `data.name`: several sets of scans, and pairs drawn by a flow
+# names in `r2flow.data.opening.SOURCES`
+SIMULATED = "simulated"
+PREPARED = "prepared"
+FOLDER = "folder"
+# other values of `data.name`: several sets of scans, and pairs drawn by a flow
+MIXED = "mixed"
+PAIRS = "pairs"
 Data = dict[str, Any]  # of a config
 
 
@@ -79,9 +77,8 @@ class PartOptions(SourceOptions):
     """One part of a mixture (`data.parts`)."""
 
     weight: Positive | None = None  # relative share of a run's images
-    sensor: Mapping[str, Any] | None = (
-        None  # `build_sensor`; None: the run's. Only stage=transfer takes several
-    )
+    # `build_sensor`; None: the run's. Only stage=transfer takes several
+    sensor: Mapping[str, Any] | None = None
 
 
 @strict
@@ -91,9 +88,8 @@ class ValidationOptions:
 
     share: Portion = 0.1  # approximate share of the scans to hold out, in one contiguous block
     scans: Natural = 64  # maximum number of validation scans
-    data: Mapping[str, Any] | None = (
-        None  # another set of scans to hold out instead: {name, root, split, drives, ...}
-    )
+    # another set of scans to hold out instead: {name, root, split, drives, ...}
+    data: Mapping[str, Any] | None = None
 
 
 @strict
@@ -102,16 +98,14 @@ class PairOptions:
     """Settings of a set of pairs (`data.pairs`)."""
 
     num: Count = 1000
-    sampler: Mapping[str, Any] = field(
-        default_factory=lambda: {"name": "adams3"}
-    )  # of the flow that draws them
+    # of the flow that draws them
+    sampler: Mapping[str, Any] = field(default_factory=lambda: {"name": "adams3"})
     batch_size: Count = 16  # pairs solved in one batch; the last bits of a pair depend on it
     shard_mib: Positive = 16.0  # size of a shard; a killed process repeats its shard
     # seed of the noise, separate from the run's: runs of several seeds can share one set of pairs
     seed: Seed = 0
-    first: Seed | None = (
-        None  # index of the first pair; None: after the pairs that the flow itself was trained on
-    )
+    # index of the first pair; None: after the pairs that the flow itself was trained on
+    first: Seed | None = None
     precision: Precision = "32-true"  # precision of the network
     of: str | None = None  # the flow that draws the pairs; None: the stage's parent
     parent: str | None = None  # hash of the flow, filled in by the run
@@ -130,22 +124,18 @@ class DataOptions(SourceOptions):
     concatenated.
     """
 
-    parts: Sequence[Mapping[str, Any]] | None = (
-        None  # of `mixed`: {name, root, split, drives, ..., weight} each
-    )
-    augment: Mapping[str, Any] | None = (
-        None  # `r2flow.data.augment.Augmentation`, of training scans only
-    )
+    # of `mixed`: {name, root, split, drives, ..., weight} each
+    parts: Sequence[Mapping[str, Any]] | None = None
+    # `r2flow.data.augment.Augmentation`, of training scans only
+    augment: Mapping[str, Any] | None = None
     batch_size: Count = 8  # images in one optimiser step, over all devices and accumulated batches
     workers: Annotated[int, Field(ge=0, le=1000)] = 0  # loader processes per device
-    memory_gib: NonNegative = (
-        2.0  # training scans that fit into this are kept in memory, others read when needed
-    )
+    # training scans that fit into this are kept in memory, others read when needed
+    memory_gib: NonNegative = 2.0
     validation: ValidationOptions = ValidationOptions()
     pairs: PairOptions = PairOptions()
-    scans: Mapping[str, Any] | None = (
-        None  # `SourceOptions` of scans next to pairs, for the velocities of a flow map
-    )
+    # `SourceOptions` of scans next to pairs, for the velocities of a flow map
+    scans: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         for key, name in (("parts", MIXED), ("scans", PAIRS)):

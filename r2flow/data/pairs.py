@@ -49,8 +49,10 @@ class PairStore(Store):
         shape: tuple[int, int, int],
         noise_shape: tuple[int, ...] | None = None,
     ) -> None:
-        self.options, self.first = options, options.first or 0
-        self.noise_shape, self.sampler = noise_shape or shape, build_sampler(options.sampler)
+        self.options = options
+        self.first = options.first or 0
+        self.noise_shape = noise_shape or shape
+        self.sampler = build_sampler(options.sampler)
         size = options.batch_size * 2 * math.prod(shape)
         self.shard_batches = max(round(options.shard_mib * 2**20 / size), 1)
         recipe = {
@@ -116,7 +118,8 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
         raise InputError(
             f"the noise of these pairs does not have the generator's shape {generator.noise_shape}."
         )
-    flow, sampler = as_flow(generator, "a reflow pair", distilled=True), store.sampler
+    flow = as_flow(generator, "a reflow pair", distilled=True)
+    sampler = store.sampler
     sampler.check(flow)
     check(
         sampler.paired,
@@ -157,9 +160,8 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
         rank, ranks = rank_and_world_size()  # of a run, whose processes verify a part each
         for shard in store.shards[rank::ranks]:
             store.mend(shard)
-        missing = store.missing(
-            store.shards
-        )  # shuffled: processes rarely meet, also without common locks
+        # shuffled: processes rarely meet, also without common locks
+        missing = store.missing(store.shards)
         store.make(random.Random().sample(missing, len(missing)), make_shard, wait=wait)
     if usable:
         print(
@@ -176,7 +178,8 @@ def solve_batch(store: PairStore, generator: Flow, batch: int) -> dict[str, np.n
 
     x_1 is float16, (B, C, H, W); pairs that overflow float16 are not usable.
     """
-    options, sampler = store.options, store.sampler
+    options = store.options
+    sampler = store.sampler
     first = store.first + batch * options.batch_size
     indices = range(first, first + options.batch_size)
     x_0 = torch.stack([store.noise(index) for index in indices]).to(generator.device)
@@ -213,7 +216,8 @@ class PairDataset(Dataset[Item]):
 
     def __getitem__(self, key: Key) -> Item:
         k, index = (key, key) if isinstance(key, int) else key
-        store, number = self.store, int(self.numbers[index])
+        store = self.store
+        number = int(self.numbers[index])
         shard, offset = divmod(number, store.shard_batches * store.options.batch_size)
         with reading_errors(path := store.files(shard)[0]), safe_open(path, framework="pt") as file:
             x_1 = file.get_slice("x_1")[offset].float()

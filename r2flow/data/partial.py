@@ -36,14 +36,11 @@ from r2flow.lidar.transfer import (
     sensor_of,
 )
 
-FEWER = (
-    0.9  # with less than this share of rays per column, pixels between the rays are not measured
-)
+# with less than this share of rays per column, pixels between the rays are not measured
+FEWER = 0.9
 FEW = 4  # default number of simulated scans
-FROM, THROUGH = (
-    "--from, in Python by sensor",
-    "in Python Checkpoint.through of such a sensor, uses them with densify",
-)
+FROM = "--from, in Python by sensor"
+THROUGH = "in Python Checkpoint.through of such a sensor, uses them with densify"
 
 Sight = Callable[[Path, Points], Partial]  # the image of the points of a scan of this name
 Opened = tuple[list["PartialScan"], list[str]]  # scans, and lines about their sensors

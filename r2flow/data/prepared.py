@@ -63,8 +63,12 @@ class PreparedStore(Store):
         source: ScanSource | None = None,
     ) -> None:
         super().__init__(folder, KIND, recipe)
-        self.drives, self.source, self.reading = drives, source, Reading.of(recipe["reading"])
-        scans, levels, sensor = range(recipe["scans"]), recipe["levels"], self.reading.sensor
+        self.drives = drives
+        self.source = source
+        self.reading = Reading.of(recipe["reading"])
+        scans = range(recipe["scans"])
+        levels = recipe["levels"]
+        sensor = self.reading.sensor
         self.parts = [
             scans[first : first + recipe["shard_scans"]]
             for first in scans[:: recipe["shard_scans"]]

@@ -39,7 +39,8 @@ def range_codes(min_range: float, max_range: float) -> Codes:
     (max_range - min_range up to 124 m); else steps of at most `STEP` up to 65 m, and the remaining
     codes divide the rest.
     """
-    values, codes = [0.0, min_range, max_range], [0, 1, CODES - 1]
+    values = [0.0, min_range, max_range]
+    codes = [0, 1, CODES - 1]
     if (max_range - min_range) / (CODES - 2) > STEP and min_range < KNEE:
         values.insert(2, KNEE)
         codes.insert(2, 1 + math.ceil((KNEE - min_range) / STEP))

@@ -38,9 +38,8 @@ class Reading:
     sensor: Sensor
     projection: Projection = "spherical"  #: as in `r2flow.lidar.projection.project`
     convention: Convention = "centre"  #: likewise
-    reflectance_scale: float | None = (
-        1.0  #: value in the files of full reflectance; None estimates it from each file
-    )
+    #: value in the files of full reflectance; None estimates it from each file
+    reflectance_scale: float | None = 1.0
     #: Whether images have reflectance: True requires it of every scan; `auto`: see
     #: `lacks_reflectance`.
     reflectance: bool | str = AUTO

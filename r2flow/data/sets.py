@@ -22,7 +22,9 @@ class ScanSet:
     """
 
     def __init__(self, label: str, source: ScanSource, sensor: Sensor) -> None:
-        self.label, self.source, self.sensor = label, source, sensor
+        self.label = label
+        self.source = source
+        self.sensor = sensor
         self.drives = source.drives
 
     @cached_property
@@ -45,7 +47,8 @@ class ScanSet:
     def part(self, numbers: Sequence[int], name: str) -> "ScanSet":
         """Some of the scans, in the given order; `name` describes the selection."""
         part = copy.copy(self)
-        part.source, part.about = self.source.subset(numbers), {**self.about, "part": name}
+        part.source = self.source.subset(numbers)
+        part.about = {**self.about, "part": name}
         if self.identity is not None:  # a part of a part differs from the same numbers of the whole
             chosen = [self.identity.get("part"), *numbers]
             part.identity = {**self.identity, "part": checksum(chosen)[:16]}
@@ -82,9 +85,8 @@ class ScanSet:
         loader = DataLoader(
             chunks, None, collate_fn=read, num_workers=workers, worker_init_fn=init_loader_worker
         )
-        with (
-            blocking_signals() if workers else nullcontext()
-        ):  # the end of a process would be an error here
+        # the end of a process would be an error here
+        with blocking_signals() if workers else nullcontext():
             return iter(loader)
 
 

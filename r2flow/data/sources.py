@@ -51,9 +51,8 @@ class ScanSource(ABC):
     #: whether a network draws the images on access: only in this process, each image once if
     #: possible
     drawn = False
-    drives: Mapping[
-        str, Sequence[int]
-    ] = {}  #: numbers of the scans of each recording, by its name, if known
+    #: numbers of the scans of each recording, by its name, if known
+    drives: Mapping[str, Sequence[int]] = {}
     contents = ""  #: digest of what is cheaply known of the scans, equal for a copy of the data set
 
     @abstractmethod
@@ -255,7 +254,8 @@ class ScanFiles(ScanSource):
         """Hash of all names and sizes, with `times` also of the times of change, and of the
         contents of some files.
         """
-        stats, hashes = [], []
+        stats = []
+        hashes = []
         for name, path in zip(self.names, self.paths, strict=True):
             with suppress(OSError):  # reported when the scan is read
                 stat = os.stat(path)
@@ -370,9 +370,8 @@ class SimulatedScans(MadeScans):
 
     @property
     def contents(self) -> str:  # type: ignore[override]
-        return (
-            f"simulator {simulator.REVISION}"  # its revisions draw different scans of the same name
-        )
+        # its revisions draw different scans of the same name
+        return f"simulator {simulator.REVISION}"
 
     def __getitem__(self, index: int) -> np.ndarray:
         return simulator.simulate(self.sensor, self.seed, self.numbers[index]).image[
@@ -386,7 +385,8 @@ class InMemory(ScanSource):
     names: Sequence[str] = ()  # set for each instance; the base class has a property
 
     def __init__(self, images: np.ndarray, names: Sequence[str]) -> None:
-        self.images, self.names = images, names
+        self.images = images
+        self.names = names
 
     def subset(self, indices: Sequence[int]) -> "InMemory":
         return InMemory(self.images[list(indices)], [self.names[i] for i in indices])

@@ -11,7 +11,9 @@ from r2flow.lidar.sensors import Convention, Sensor
 
 NOISE = 0.1  # degrees by which a laser may lie above that of the row before it in any case
 FEW = 5  # returns below which the median elevation of a ring is not known
-FEWEST, MOST = 4, 256  # limits of the number of beams
+# limits of the number of beams
+FEWEST = 4
+MOST = 256
 TIGHT = 0.1  # scatter below which points of one beam are together
 _BACK = 1 / 12  # of a turn, by which azimuths fall back at a new ring; at most half its width
 _NEARBY = 1 / 36  # of a turn: neighbouring points are nearer

@@ -116,9 +116,8 @@ class Checkpoint:
                 "give a path, images (B, 2 or 1, H, W) or points (N, 3 or 4); found "
                 f"{shape or type(images)}.",
             )
-            if not isinstance(
-                images, Tensor
-            ):  # a message's points: read-only or big-endian, which torch does not take
+            # a message's points: read-only or big-endian, which torch does not take
+            if not isinstance(images, Tensor):
                 images = torch.from_numpy(np.array(images, images.dtype.newbyteorder("=")))
         if isinstance(images, Tensor) and images.ndim == 2:
             check(state is None, "points have the states of their rays: give no state.")
@@ -272,9 +271,8 @@ def _of_torch(content: Any, path: Path, averaged: bool) -> Checkpoint:
     if published is not None:
         converted = published.read(content, path, averaged)
         config = converted.config
-        if (
-            converted.elevations is not None
-        ):  # elevations of its own need a name of its own, as in `build_sensor`
+        # elevations of its own need a name of its own, as in `build_sensor`
+        if converted.elevations is not None:
             rings = torch.rad2deg(converted.elevations.double()).tolist()
             config["sensor"] |= {
                 "name": "hdl64e_rings_published",
@@ -348,10 +346,8 @@ def _built(
 def check_weights(model: nn.Module, weights: Mapping[str, Tensor]) -> None:
     """Check all names, shapes, types and values before loading."""
     expected = model.state_dict()
-    missing, surplus = (
-        sorted(expected.keys() - weights.keys()),
-        sorted(weights.keys() - expected.keys()),
-    )
+    missing = sorted(expected.keys() - weights.keys())
+    surplus = sorted(weights.keys() - expected.keys())
     unlike = "its weights do not fit its config:"
     names = f"{len(missing)} names missing {missing[:2]}, {len(surplus)} unknown {surplus[:2]}"
     check(not (missing or surplus), f"{unlike} {names}.")
@@ -363,12 +359,10 @@ def check_weights(model: nn.Module, weights: Mapping[str, Tensor]) -> None:
             fits and is_dense(given),
             f"{unlike} {found}, the config makes it {tuple(value.shape)} ({value.dtype}).",
         )
-    trained = (
-        name for name, _ in model.named_parameters()
-    )  # buffers may be infinite, as the mask of an attention
-    broken = next(
-        (n for n in trained if not weights[n].sum(dtype=torch.float64).isfinite()), None
-    )  # faster than all()
+    # buffers may be infinite, as the mask of an attention
+    trained = (name for name, _ in model.named_parameters())
+    # faster than all()
+    broken = next((n for n in trained if not weights[n].sum(dtype=torch.float64).isfinite()), None)
     check(
         broken is None, f"'{broken}' has values that are NaN or infinite. Use another checkpoint."
     )

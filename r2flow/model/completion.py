@@ -147,16 +147,13 @@ def complete(
         known = condition["known"] > 0
         any_known = bool(known.any())
         answers = image.new_zeros(num, 1 + generator.space.encoding.reflectance, *image.shape[1:])
-        evaluations, converged, seconds = (
-            answers.new_zeros(num).long(),
-            answers.new_ones(num).bool(),
-            0.0,
-        )
+        evaluations = answers.new_zeros(num).long()
+        converged = answers.new_ones(num).bool()
+        seconds = 0.0
         for start in range(0, 0 if bool(known.all()) else num, batch_size):
             at = slice(start, min(start + batch_size, num))
-            numbers = [
-                first + i + answer * 2**32 for answer in range(at.start, at.stop)
-            ]  # of noise: 0 is sample i's
+            # of noise: 0 is sample i's
+            numbers = [first + i + answer * 2**32 for answer in range(at.start, at.stop)]
             given = {
                 name: value.expand(len(numbers), -1, -1, -1) for name, value in condition.items()
             }
@@ -178,7 +175,8 @@ def complete(
 
 def _check_values(sensor: Sensor, images: Tensor) -> None:
     r = images[:, 0]
-    near, far = sensor.min_range * (1 - LIMIT_TOLERANCE), sensor.max_range * (1 + LIMIT_TOLERANCE)
+    near = sensor.min_range * (1 - LIMIT_TOLERANCE)
+    far = sensor.max_range * (1 + LIMIT_TOLERANCE)
     wrong = ~((r == 0) | ((r >= near) & (r <= far)))
     if bool(wrong.any()):
         raise InputError(

@@ -20,17 +20,14 @@ BACKBONE = "backbone."  # prefix of a flow's network in the generator
 class Published:
     """A generator of a published file, converted to r2flow's names."""
 
-    config: dict[
-        str, Any
-    ]  # config for `r2flow.generators.build_generator`; the file's config is under `published`
+    # config for `r2flow.generators.build_generator`; the file's config is under `published`
+    config: dict[str, Any]
     weights: dict[str, Tensor]  # the generator's weights by r2flow's names
     step: int = 0  # optimiser steps taken
-    sampler: Options | None = (
-        None  # published sampler, name and fields; None: the generator's default
-    )
-    elevations: Tensor | None = (
-        None  # of the rows of unfolded scans in radians, (H,); None: the sensor's
-    )
+    # published sampler, name and fields; None: the generator's default
+    sampler: Options | None = None
+    # of the rows of unfolded scans in radians, (H,); None: the sensor's
+    elevations: Tensor | None = None
     fixed: bool = False  # whether it is distilled for this sampler alone
 
 
@@ -39,9 +36,8 @@ class Format(NamedTuple):
 
     system: str  # name of the system
     holds: Callable[[Any], bool]  # whether the content of a torch file has this format
-    read: Callable[
-        [Any, Path, bool], Published
-    ]  # convert the content, with averaged or raw weights
+    # convert the content, with averaged or raw weights
+    read: Callable[[Any, Path, bool], Published]
 
 
 def has_keys(*keys: str, but: str | None = None) -> Callable[[Any], bool]:

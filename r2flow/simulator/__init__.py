@@ -22,9 +22,8 @@ REVISION = 4  # of the scans: incremented with every change of the scans of a se
 class SimulatedScan:
     """A simulated scan with labels."""
 
-    image: (
-        np.ndarray
-    )  # range in metres and reflectance in [0, 1], (2, H, W), float32; 0 where missing
+    # range in metres and reflectance in [0, 1], (2, H, W), float32; 0 where missing
+    image: np.ndarray
     labels: np.ndarray  # SemanticKITTI ids, (H, W), uint16; 0 where missing
 
 

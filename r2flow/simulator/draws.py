@@ -15,9 +15,8 @@ import numpy as np
 from numpy import ndarray
 from numpy.random import Generator
 
-_ENTRIES = (
-    8192  # of a table of quantiles; the outermost Gaussian quantiles are at 3.8 standard deviations
-)
+# of a table of quantiles; the outermost Gaussian quantiles are at 3.8 standard deviations
+_ENTRIES = 8192
 # Coefficients of sin(2 pi t) / t in powers of t^2, the highest first.
 _TAYLOR = np.array(
     [(-1) ** k * math.tau ** (2 * k + 1) / math.factorial(2 * k + 1) for k in reversed(range(7))]

@@ -44,20 +44,15 @@ class Ground(NamedTuple):
     """
 
     streets: tuple[Street, ...]  # the car's, and others
-    waves: tuple[
-        tuple[float, float, float, float], ...
-    ] = ()  # rows (A in metres, k_x and k_y in radians / metre, phi)
-    lean: tuple[float, float] = (
-        0.0,
-        0.0,
-    )  # slope along x and y relative to the car, which leans on its springs
+    # rows (A in metres, k_x and k_y in radians / metre, phi)
+    waves: tuple[tuple[float, float, float, float], ...] = ()
+    # slope along x and y relative to the car, which leans on its springs
+    lean: tuple[float, float] = (0.0, 0.0)
     drop: float = 0.0  # how far the ground is below its default height under the sensor, in metres
     kerb: float = 0.0  # height of the kerb in metres
     tufts: float = 0.0  # height in metres of grass and rubble beyond the pavements
-    banks: tuple[float, float] = (
-        0.0,
-        0.0,
-    )  # rise next to the first street, left and right, in metres
+    # rise next to the first street, left and right, in metres
+    banks: tuple[float, float] = (0.0, 0.0)
     corner: float = 4.0  # radius of the kerb at junctions, in metres
     paved: bool = False  # whether the ground beyond the pavements is paved, not grass
     yards: tuple[Footprint, ...] = ()  # paved drives and yards next to the street
@@ -164,9 +159,8 @@ class Ground(NamedTuple):
         s = np.where(np.isfinite(distance), distance, 0)
         x = s * rays.cos
         y = s * rays.sin
-        share = np.clip(
-            (self.off_street(x, y) - self.pavement) * 2, 0, 1
-        )  # grows over half a metre
+        # grows over half a metre
+        share = np.clip((self.off_street(x, y) - self.pavement) * 2, 0, 1)
         h = (
             0.25
             * (2 + sine(2.3 * x + 1.1 * y) * sine(0.7 * x - 2.9 * y) + sine(4.1 * x - 3.3 * y))
@@ -199,9 +193,8 @@ def _meet_profile(
     """
     skyline = np.maximum.accumulate((z - height.mean()) / s, axis=0)
     slope = slope[:, None]
-    piece = sum(
-        level < slope for level in skyline
-    )  # the number of profile points with a skyline below the ray
+    # the number of profile points with a skyline below the ray
+    piece = sum(level < slope for level in skyline)
     # Before the first point, the ground is level.
     s = np.pad(s[:, 0], (1, 0))
     z = np.concatenate([z[:1], z])

@@ -102,9 +102,8 @@ def _crossed(draws: ScalarDraws, main: Street) -> tuple[Street, ...]:
         pavement=draws.uniform(1.2, 2.5),
     )
     form = draws.pick(("cross", "left", "right", "end"), (0.4, 0.2, 0.2, 0.2))
-    for _ in range(
-        20
-    ):  # to where the centre lines cross, `at` along the first and `middle` along the other
+    # to where the centre lines cross, `at` along the first and `middle` along the other
+    for _ in range(20):
         middle, _ = across.locate(*main.place(at, 0.0)[:2])
         at, lateral = main.locate(*across.place(middle, 0.0)[:2])
     if abs(lateral) >= main.half_width:  # they run side by side

@@ -90,15 +90,13 @@ class Rays:
         self.columns = columns
         self.ground = ground
         self.shape = len(lasers.elevation), columns
-        self.azimuth = (
-            np.pi - 2 * np.pi * (np.arange(columns) + 0.5) / columns
-        )  # a in radians, (W,), float64
+        # a in radians, (W,), float64
+        self.azimuth = np.pi - 2 * np.pi * (np.arange(columns) + 0.5) / columns
         self.cos = np.cos(self.azimuth).astype(np.float32)
         self.sin = np.sin(self.azimuth).astype(np.float32)
         self.slope = np.tan(lasers.elevation).astype(np.float32)  # T, decreasing, (B,)
-        self.height = (lasers.height + ground).astype(
-            np.float32
-        )  # z of each laser above the scene's z = 0, (B,)
+        # z of each laser above the scene's z = 0, (B,)
+        self.height = (lasers.height + ground).astype(np.float32)
 
 
 def _expand(first: ndarray, count: ndarray) -> tuple[ndarray, ndarray]:

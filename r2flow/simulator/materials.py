@@ -10,6 +10,5 @@ from r2flow.simulator.tables import TABLES
 
 MATERIALS: dict[str, list[float]] = TABLES["materials"]
 INDEX = {name: k for k, name in enumerate(MATERIALS)}
-ALBEDO, _, TEXTURE, GLOSS, SWALLOW, DEPTH = np.array(
-    [*MATERIALS.values()], np.float32
-).T  # of all materials
+# of all materials
+ALBEDO, _, TEXTURE, GLOSS, SWALLOW, DEPTH = np.array([*MATERIALS.values()], np.float32).T

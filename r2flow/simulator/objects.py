@@ -7,7 +7,9 @@ from r2flow.simulator.streets import Pose
 from r2flow.simulator.tables import TABLES
 
 _NEAR = 40  # metres: clumps of leaves farther away are not resolved by rays
-_SILL, _BONNET = 0.22, 0.70  # metres: heights of the body's lower edge and of the bonnet's front
+# metres: heights of the body's lower edge and of the bonnet's front
+_SILL = 0.22
+_BONNET = 0.70
 
 
 class ObjectBuilder(SceneBuilder):

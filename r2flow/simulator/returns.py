@@ -27,10 +27,9 @@ _ALONE = 0.0014
 _PATCH = 3  # columns lost together: dark and slanted surfaces are wider than a bin
 _FAINT = -0.10  # far returns with a reflectance below this are mostly lost
 _SOFT = 0.02  # width of the transition, in units of reflectance
-_LOST, _LOST_FROM = (
-    0.012,
-    8.0,
-)  # share of faint returns lost per metre of range beyond a distance in metres
+# share of faint returns lost per metre of range beyond a distance in metres
+_LOST = 0.012
+_LOST_FROM = 8.0
 
 
 def report(

@@ -81,9 +81,8 @@ class Street(NamedTuple):
     pavement: float  # width of the pavements in metres; 0 for none
     start: float = -1e6  # u of its start in metres
     stop: float = 1e6  # u of its end in metres
-    lines: tuple[
-        float, ...
-    ] = ()  # lateral coordinates of painted lines in metres; the centre line is dashed
+    # lateral coordinates of painted lines in metres; the centre line is dashed
+    lines: tuple[float, ...] = ()
 
     def locate(self, x: Where, y: Where) -> tuple[Where, Where]:
         """(u, lateral): metres along the street and to the left of its centre line."""

@@ -32,13 +32,11 @@ class Tasks:
 
     rows: Count = 32  # of a crop, at most those of the run's sensor
     columns: Count = 256  # likewise
-    halved: Portion = (
-        0.3  # share of crops at half the rows and a quarter of the columns, for coarser images
-    )
+    # share of crops at half the rows and a quarter of the columns, for coarser images
+    halved: Portion = 0.3
     silent: Portion = 0.05  # share of crops with unknown reflectance
-    unnumbered: Portion = (
-        0.1  # share of crops without the vectors learned per row, for other sensors
-    )
+    # share of crops without the vectors learned per row, for other sensors
+    unnumbered: Portion = 0.1
 
     def size(self, space: ModelSpace) -> tuple[int, int]:
         """Rows and columns of a crop, for the space of the run's sensor."""
@@ -53,9 +51,8 @@ class Tasks:
         `own`, the generator's space, determines the size of the crops; x_1 is a scan of `sensor`.
         """
         space = own if sensor == own.sensor else own.through(sensor)
-        if (
-            sensor.name != own.sensor.name and space.encoding.reflectance
-        ):  # as in use: intensities of sensors differ
+        # as in use: intensities of sensors differ
+        if sensor.name != own.sensor.name and space.encoding.reflectance:
             x_1 = scaled(x_1[None], gain_of(space, x_1[None], torch.ones_like(x_1[None])))[0]
         halve, silent, unnumbered, top, left = draws.random(5)
         elevations = space.rays[0, :, 0]

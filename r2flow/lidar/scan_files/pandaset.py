@@ -136,7 +136,9 @@ def _aligned(xyz: ndarray, times: ndarray) -> ndarray:
         beam = np.searchsorted(between, elevation)
         residual = beams[beam] - elevation
         weight = (apart[beam] > 2 * scale) / (1 + (residual / scale) ** 2)
-        cos, sin, square = x / level, y / level, level**2 + z**2
+        cos = x / level
+        sin = y / level
+        square = level**2 + z**2
         each = [sin, -cos, z * cos / square, z * sin / square, -level / square]
         slopes = np.hstack([slope[:, None] * near[chosen] for slope in each])
         weighted = slopes.T * weight

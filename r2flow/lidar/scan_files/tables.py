@@ -128,9 +128,8 @@ def read_las(path: Path) -> Table:
     import laspy
 
     content = path.read_bytes()
-    records = 54 * int.from_bytes(
-        content[100:104], "little"
-    )  # laspy allocates what a header declares
+    # laspy allocates what a header declares
+    records = 54 * int.from_bytes(content[100:104], "little")
     if content[24:26] == b"\x01\x04":
         records += 60 * int.from_bytes(content[243:247], "little")
     if records > len(content):
