@@ -27,7 +27,7 @@ import lightning as L
 import torch
 
 from r2flow.backbones import Backbone, build_backbone, configurations
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.sensors import build_sensor
 from r2flow.reports.backbones import RULE, count_macs, count_parameters
 from r2flow.training import build, compose, fit

@@ -15,8 +15,8 @@ from pathlib import Path
 import torch
 
 import r2flow
+from r2flow.base.noise import Draws
 from r2flow.model.export import compare, export
-from r2flow.noise import Draws
 
 
 def main() -> None:

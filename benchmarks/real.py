@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import t as student
 
+from r2flow.base.errors import InputError
 from r2flow.data.reading import Reading, read_image
-from r2flow.errors import InputError
 from r2flow.lidar.estimation import estimate_sensor
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS, Sensor

@@ -12,8 +12,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from r2flow.base.noise import generator
 from r2flow.lidar.sensors import SENSORS, Sensor
-from r2flow.noise import generator
 from r2flow.simulator import draw_scene, simulate
 from r2flow.simulator.lasers import Rays, lasers_of
 from r2flow.simulator.raycast import cast

@@ -20,10 +20,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from r2flow.base.noise import Draws, standard_normal
 from r2flow.flow.problems import Discontinuous, Gaussian, Problem, RayDrop, Straight, TwoModes
 from r2flow.flow.solvers import Velocity, solve
 from r2flow.model.checkpoint import load_checkpoint
-from r2flow.noise import Draws, standard_normal
 from r2flow.reports.tables import table
 
 ELEMENTS = 256

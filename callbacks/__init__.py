@@ -2,8 +2,8 @@
 
 from lightning.pytorch.callbacks import Callback
 
-from r2flow.errors import InputError
-from r2flow.registry import Options, Registry, construct
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Options, Registry, construct
 
 from .checkpoints import Checkpoints
 from .curvature import Curvature

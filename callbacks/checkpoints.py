@@ -9,11 +9,11 @@ import torch
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from lightning.pytorch.callbacks import Checkpoint
 
-from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.base.errors import InputError
+from r2flow.base.files import atomic_write
+from r2flow.base.registry import Count
 from r2flow.model.paths import FOLDER, checkpoints_of, step_of
 from r2flow.model.tensor_files import read_checkpoint
-from r2flow.registry import Count
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):

@@ -2,10 +2,10 @@
 
 import lightning as L
 
+from r2flow.base.noise import Draws
+from r2flow.base.registry import Count, Natural
 from r2flow.flow.straightness import straightness
 from r2flow.generators import Flow
-from r2flow.noise import Draws
-from r2flow.registry import Count, Natural
 
 from .periodic import Periodic, seed_of
 

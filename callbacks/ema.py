@@ -8,7 +8,7 @@ import lightning as L
 from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
 
-from r2flow.registry import Count, Natural, Portion, Positive, Registry
+from r2flow.base.registry import Count, Natural, Portion, Positive, Registry
 
 # Decays, at most `decay`, of n = 1, 2, ..., the steps after the warm-up, during which it is 0.
 DECAYS: Registry[Callable[[int], float]] = Registry(

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 from torch.nn.utils import get_total_norm
 
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Count, NonNegative
+from r2flow.base.signals import wait_for_launcher
 from r2flow.data.loader import RunSampler
-from r2flow.errors import InputError
 from r2flow.model.paths import checkpoints_of
-from r2flow.registry import Count, NonNegative
-from r2flow.signals import wait_for_launcher
 
 log = logging.getLogger(__name__)
 

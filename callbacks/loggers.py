@@ -20,8 +20,8 @@ from lightning.pytorch.loggers import (
     WandbLogger,
 )
 
-from r2flow.errors import InputError, one_line, require
-from r2flow.registry import Registry
+from r2flow.base.errors import InputError, one_line, require
+from r2flow.base.registry import Registry
 
 PROJECT = "r2flow"
 

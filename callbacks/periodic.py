@@ -7,9 +7,9 @@ from typing import Any
 import lightning as L
 import torch
 
+from r2flow.base.registry import Count, Natural
 from r2flow.generators import Generator, Sampler
 from r2flow.model.sampling import draw
-from r2flow.registry import Count, Natural
 from r2flow.reports.pictures import contact_sheet, figure_pixels, save_figure
 
 from .ema import averaged_weights

@@ -6,8 +6,8 @@ from typing import Any
 import lightning as L
 from lightning.pytorch.callbacks import ProgressBar
 
-from r2flow.progress import Bar
-from r2flow.registry import NonNegative
+from r2flow.base.progress import Bar
+from r2flow.base.registry import NonNegative
 
 
 class Progress(ProgressBar):

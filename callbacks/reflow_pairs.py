@@ -2,9 +2,9 @@
 
 import lightning as L
 
+from r2flow.base.errors import InputError
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.pairs import make_pairs
-from r2flow.errors import InputError
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.lineage import find_parent
 

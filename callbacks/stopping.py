@@ -15,9 +15,8 @@ import lightning as L
 from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.pytorch.utilities import rank_zero_only
 
-from r2flow.model.paths import checkpoints_of
-from r2flow.registry import Count
-from r2flow.signals import (
+from r2flow.base.registry import Count
+from r2flow.base.signals import (
     LATER,
     STOPPING,
     Stopped,
@@ -26,6 +25,7 @@ from r2flow.signals import (
     install_handlers,
     wait_for_launcher,
 )
+from r2flow.model.paths import checkpoints_of
 
 from .checkpoints import Checkpoints
 

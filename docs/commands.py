@@ -16,10 +16,10 @@ from pathlib import Path
 import typer
 from hydra.errors import HydraException
 
+from r2flow.base.errors import InputError
+from r2flow.base.plugins import take_plugins
 from r2flow.cli.verbs import USAGE_ERROR, app
-from r2flow.errors import InputError
 from r2flow.lidar.sensors import SENSORS, write_sensor
-from r2flow.plugins import take_plugins
 from r2flow.runs.composing import compose, in_one_line
 
 DOCS = Path(__file__).resolve().parent

@@ -18,9 +18,9 @@ from typing import Any
 import typer
 
 from r2flow.backbones import BACKBONES
+from r2flow.base.registry import Registry
 from r2flow.cli.options import SETS
 from r2flow.cli.verbs import app
-from r2flow.registry import Registry
 from r2flow.runs.composing import CONF
 from r2flow.stages import STAGES
 

@@ -75,7 +75,7 @@ def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoin
     Raises:
         InputError: unknown model, unusable file or unavailable device.
     """
-    from r2flow.devices import choose_device
+    from r2flow.base.devices import choose_device
     from r2flow.model.checkpoint import load_checkpoint
 
     return load_checkpoint(name, choose_device(str(device), "device"))

@@ -27,13 +27,13 @@ from filelock import FileLock, Timeout
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from r2flow.config import at_most_three, differences
-from r2flow.errors import InputError
-from r2flow.files import read_json, write_file
-from r2flow.hashing import state_hash
+from r2flow.base.config import at_most_three, differences
+from r2flow.base.errors import InputError
+from r2flow.base.files import read_json, write_file
+from r2flow.base.hashing import state_hash
+from r2flow.base.pool import attempts_of
+from r2flow.base.registry import Config, Options
 from r2flow.lidar.scan_files import FIRM_ENDINGS
-from r2flow.pool import attempts_of
-from r2flow.registry import Config, Options
 
 log = logging.getLogger(__name__)
 

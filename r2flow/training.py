@@ -21,16 +21,16 @@ import lightning as L
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.utilities.model_helpers import is_overridden
 
+from r2flow.base.config import as_override
+from r2flow.base.errors import InputError, check_folder, one_line
+from r2flow.base.signals import LATER, STOPPING, Stopped, handling_signals
 from r2flow.callbacks.loggers import log_config
 from r2flow.callbacks.stopping import Stopping
-from r2flow.config import as_override
-from r2flow.errors import InputError, check_folder, one_line
 from r2flow.model.paths import checkpoints_of, step_of
 from r2flow.reports.training import finish, read_curves
 from r2flow.runs.building import Run, build, check, quiet
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import has_ended, open_run, run_lock
-from r2flow.signals import LATER, STOPPING, Stopped, handling_signals
 
 __all__ = ["Result", "Run", "build", "check", "compose", "fit"]
 
@@ -62,7 +62,8 @@ def fit(run: Run) -> Result:
 
     Raises:
         InputError: unreadable scans, another run in its folder, non-finite weights, a full disk.
-        r2flow.signals.Stopped: a stop signal was received, or another device's process was killed.
+        r2flow.base.signals.Stopped: a stop signal was received, or another device's process was
+            killed.
     """
     callbacks: list[L.Callback] = run.trainer.callbacks  # type: ignore[attr-defined]
     stopping = next(

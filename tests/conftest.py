@@ -19,16 +19,17 @@ from hydra._internal.hydra import Hydra
 from matplotlib.figure import Figure
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 
-from r2flow import cli, errors
+from r2flow import cli
+from r2flow.base import errors
+from r2flow.base.errors import InputError
+from r2flow.base.registry import construct
 from r2flow.data.opening import find_drives
 from r2flow.data.prepared import plan_files, prepare
 from r2flow.data.reading import Reading
-from r2flow.errors import InputError
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.parts import MODEL
-from r2flow.registry import construct
 from r2flow.reports.pictures import save_figure
 from r2flow.stages import STAGES
 from r2flow.stages.base import Stage

@@ -71,7 +71,7 @@ def too_long(*_: object) -> None:
 
 
 def finding(read: Callable[[Path], object], path: Path, whole: object) -> tuple[bool, str | None]:
-    from r2flow.errors import InputError
+    from r2flow.base.errors import InputError
 
     signal.alarm(PATIENCE)
     try:

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from r2flow.base.errors import InputError
+from r2flow.base.files import reading
 from r2flow.data.opening import SOURCES, Described, describe
 from r2flow.data.options import PairOptions, SourceOptions
 from r2flow.data.pairs import PairStore
 from r2flow.data.prepared import PreparedScans
 from r2flow.data.reading import Reading, read_image
-from r2flow.errors import InputError
-from r2flow.files import reading
 from r2flow.lidar.labels import read_labels
 from r2flow.lidar.scan_files import LARGEST_FILE, read_points
 from r2flow.lidar.scan_files.pickled import read_table

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import torch
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 
 # The n-th rename, and whether the process dies before it or after it.
 MOMENTS = [

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.reports.ablation import (
     TIMES,
     Groups,

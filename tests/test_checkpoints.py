@@ -11,7 +11,7 @@ import safetensors.torch
 import torch
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import build_space
 from r2flow.model.checkpoint import Checkpoint, check_weights, load_checkpoint

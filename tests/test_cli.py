@@ -9,7 +9,7 @@ import pytest
 import torch.distributed.run
 
 from r2flow import load
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import read_points, write_points
 from tests.conftest import CONFIG, SENSOR, tiny_options, write_checkpoint, write_run, write_scan

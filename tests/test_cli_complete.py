@@ -10,17 +10,17 @@ import pytest
 import torch
 
 import r2flow
+from r2flow.base.errors import InputError
+from r2flow.base.noise import generator
 from r2flow.data.opening import open_scans
 from r2flow.data.partial import open_partial
 from r2flow.data.reading import Reading
-from r2flow.errors import InputError
 from r2flow.lidar.known import Ray, parse_mask
+from r2flow.lidar.other_sensors import image_through
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS, write_sensor
-from r2flow.lidar.transfer import image_through
 from r2flow.model import checkpoint
-from r2flow.noise import generator
 from r2flow.reports import completed
 from r2flow.simulator import simulate
 from tests.conftest import SENSOR, Done, prepare_folder, write_run
@@ -272,7 +272,9 @@ def test_answers_to_another_scan_of_the_same_name_are_none(complete, tmp_path, e
 
 def test_prepared_scans_are_named_by_their_numbers_in_the_set(complete, tmp_path, monkeypatch):
     # no pause
-    monkeypatch.setattr("r2flow.progress.Bar.__init__.__defaults__", ("scans", None, False, 0, 0.0))
+    monkeypatch.setattr(
+        "r2flow.base.progress.Bar.__init__.__defaults__", ("scans", None, False, 0, 0.0)
+    )
     for place, number in enumerate([0, 1, 0, 1]):
         full_scan(tmp_path / "scans" / f"{place}.npy", number)
     given = prepare_folder(tmp_path / "scans", tmp_path / "prep", SENSOR)

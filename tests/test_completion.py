@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.generators import Generator
 from r2flow.lidar.known import Ray, ray_states
 from r2flow.model import completion

@@ -11,13 +11,13 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from r2flow.callbacks import CALLBACKS
 
 from r2flow.backbones import BACKBONES, configurations
-from r2flow.config import FREE, LINKS, as_override, flatten, key_of
+from r2flow.base.config import FREE, LINKS, as_override, flatten, key_of
+from r2flow.base.errors import InputError
+from r2flow.base.registry import options_of
 from r2flow.data.augment import Augmentation
 from r2flow.data.options import DataOptions, PairOptions
-from r2flow.errors import InputError
 from r2flow.model.lineage import Parent
 from r2flow.model.parts import MODEL
-from r2flow.registry import options_of
 from r2flow.runs.composing import CONF, choices, compose
 from r2flow.stages import STAGES
 from r2flow.training import check

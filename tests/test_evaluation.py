@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from r2flow.base.errors import InputError
+from r2flow.base.noise import standard_normal
 from r2flow.data.opening import open_scans, reading_for
 from r2flow.data.reading import Reading
 from r2flow.data.sets import ScanSet, fixed_choice
-from r2flow.errors import InputError
 from r2flow.evaluation import measuring
 from r2flow.evaluation.comparing import Comparison, with_equal_panels
 from r2flow.evaluation.measuring import (
@@ -31,7 +32,6 @@ from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.metrics.jsd_mmd import JSD, MMD
 from r2flow.metrics.panel import PANEL, REFLECTANCE
-from r2flow.noise import standard_normal
 from r2flow.reports.verdict import remarks_of, verdict
 from r2flow.samplers import build_sampler
 from tests.conftest import SENSOR, folder, images
@@ -105,7 +105,7 @@ class TestCache:
         keys.append(key())
         plugin = tmp_path / "plugin.py"
         monkeypatch.setattr(
-            "r2flow.plugins._loaded", {str(plugin): "plugin.py", "a.module": "a.module"}
+            "r2flow.base.plugins._loaded", {str(plugin): "plugin.py", "a.module": "a.module"}
         )
         for code in ("x = 1", "x = 2"):
             plugin.write_text(code)

@@ -12,11 +12,11 @@ import torch
 
 from r2flow import __version__
 from r2flow.backbones import BACKBONES
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.noise import Draws
 from r2flow.generators import RectifiedFlow, build_generator
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.export import NOTES, _traced, compare, export, tableau
-from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from tests.conftest import ROOT, tiny_options
 
@@ -132,7 +132,7 @@ def test_an_export_leaves_the_model_as_it_was_and_takes_a_samplers_name(tmp_path
 def test_a_missing_package_names_its_extra_before_the_work_begins(
     r2flow, saved, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("r2flow.errors.find_spec", lambda name: None)
+    monkeypatch.setattr("r2flow.base.errors.find_spec", lambda name: None)
     missing = "an .onnx needs the package onnx: python -m pip install 'r2flow[export]'."
     assert r2flow("export", saved[0], "--out", tmp_path / "flow.onnx") == (
         2,

@@ -7,9 +7,9 @@ import struct
 import pytest
 import torch
 
-from r2flow.errors import InputError, explain_mistake
-from r2flow.files import atomic_write
-from r2flow.hashing import state_hash
+from r2flow.base.errors import InputError, explain_mistake
+from r2flow.base.files import atomic_write
+from r2flow.base.hashing import state_hash
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
@@ -76,7 +76,7 @@ def test_a_read_only_folder_is_an_error_with_the_file_s_own_name(tmp_path, monke
     def refused(path, *_, **__):
         raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
-    monkeypatch.setattr("r2flow.files.open", refused, raising=False)
+    monkeypatch.setattr("r2flow.base.files.open", refused, raising=False)
     with pytest.raises(PermissionError) as raised, atomic_write(tmp_path / "out.json"):
         pass
     assert explain_mistake(raised.value) == f"{tmp_path / 'out.json'}: Permission denied"

@@ -6,16 +6,16 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from r2flow.base.errors import InputError
+from r2flow.base.noise import Draws, standard_normal
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.loader import FlowDataset
 from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairDataset, PairStore, make_pairs
-from r2flow.errors import InputError
 from r2flow.flow.maps import OBJECTIVES
 from r2flow.flow.problems import Gaussian
 from r2flow.generators import FlowMap, RectifiedFlow, build_generator
 from r2flow.model.lineage import Parent, model_options
-from r2flow.noise import Draws, standard_normal
 from r2flow.samplers import build_sampler
 from r2flow.stages import STAGES
 from r2flow.stages.flow_map import LearnFlowMap

@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 
 import r2flow
 from r2flow import Distill, Rectify, Reflow, ScanDataModule
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from tests.conftest import ROOT, quiet_trainer
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*")

@@ -7,15 +7,15 @@ from typing import Any
 import pytest
 import torch
 
+from r2flow.base.errors import InputError
+from r2flow.base.registry import construct
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.options import DataOptions
 from r2flow.data.resolving import plan_data
-from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.lineage import Parent, find_parent
 from r2flow.model.saving import weights_hash
-from r2flow.registry import construct
 from r2flow.runs.composing import compose
 from r2flow.store import Store
 from r2flow.training import check

@@ -10,8 +10,8 @@ import torch
 from safetensors import safe_open
 
 import r2flow
-from r2flow.config import learned
-from r2flow.errors import InputError
+from r2flow.base.config import learned
+from r2flow.base.errors import InputError
 from r2flow.evaluation.sets import is_checkpoint
 from r2flow.lidar.interpolation import interpolated
 from r2flow.lidar.known import parse_mask, ray_states
@@ -20,7 +20,7 @@ from r2flow.metrics.completion import errors
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.paths import find_checkpoint
 from r2flow.model.saving import save_checkpoint
-from r2flow.models import MODELS, find_model, name_of
+from r2flow.model.shipped import MODELS, find_model, name_of
 from r2flow.simulator import simulate
 from tests.conftest import ROOT
 
@@ -125,7 +125,7 @@ def test_a_run_or_a_file_of_a_models_name_comes_first(saved, tmp_path, monkeypat
 
 def test_a_damaged_file_is_not_the_model(tmp_path, monkeypatch):
     data = bytearray(find_model("densify").read_bytes())
-    monkeypatch.setattr("r2flow.models.FOLDER", tmp_path)
+    monkeypatch.setattr("r2flow.model.shipped.FOLDER", tmp_path)
     with pytest.raises(InputError, match="the model densify is not here"):
         load_checkpoint("densify")
     data[-1] ^= 1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.noise import PURPOSES, Draws
+from r2flow.base.noise import PURPOSES, Draws
 
 
 def expected(seed: int, purpose: str, index: int, step: int = 0) -> torch.Tensor:

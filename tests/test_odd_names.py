@@ -9,8 +9,8 @@ import pytest
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from r2flow.errors import InputError, explain_mistake
-from r2flow.files import atomic_write
+from r2flow.base.errors import InputError, explain_mistake
+from r2flow.base.files import atomic_write
 from r2flow.reports.pages import blank_figure
 from r2flow.reports.pictures import figure_pixels
 from tests.conftest import small_disk, write_scan
@@ -99,5 +99,5 @@ def test_a_newline_in_a_name_does_not_eat_the_line():
     # nor does it control the terminal
     assert explain_mistake(InputError("a\033[31mb")) == r"a\x1b[31mb"
     of_a_worker = "Caught InputError in DataLoader worker process 0.\nOriginal Traceback (most recent call last):\n"
-    of_a_worker += '  File "x", line 1\nr2flow.errors.InputError: a\nb.bin is empty.\n'
+    of_a_worker += '  File "x", line 1\nr2flow.base.errors.InputError: a\nb.bin is empty.\n'
     assert explain_mistake(InputError(of_a_worker)) == r"a\nb.bin is empty."

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from r2flow.base.errors import InputError
 from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading
-from r2flow.errors import InputError
 from r2flow.evaluation.measuring import Work, _real_rule, gather_real, measure
 from r2flow.evaluation.protocols import PAPER, R2FLOW, _published_choice
 from r2flow.lidar.scan_files import write_points

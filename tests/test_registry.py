@@ -3,8 +3,8 @@ from typing import Annotated
 
 import pytest
 
-from r2flow.errors import InputError
-from r2flow.registry import MISSING, Registry, check_options, options_of
+from r2flow.base.errors import InputError
+from r2flow.base.registry import MISSING, Registry, check_options, options_of
 
 
 def test_a_name_that_is_taken_is_refused_except_in_a_notebook():

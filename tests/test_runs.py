@@ -9,8 +9,8 @@ import pytest
 import torch
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 
-from r2flow.config import check_tree
-from r2flow.errors import InputError
+from r2flow.base.config import check_tree
+from r2flow.base.errors import InputError
 from r2flow.runs.folder import (
     RESUMED,
     check_run,

@@ -14,17 +14,17 @@ import torch
 from torch import nn
 
 import r2flow
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.noise import Draws
+from r2flow.base.progress import Bar
 from r2flow.evaluation.sets import sampled_set
 from r2flow.generators import Generator, Sampler, build_generator
-from r2flow.inversion import interpolate_scans, invert, round_trip, slerp
 from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.lidar.region import region
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import completing
+from r2flow.model.inversion import interpolate_scans, invert, round_trip, slerp
 from r2flow.model.sampling import draw, evaluated_region, sample
-from r2flow.noise import Draws
-from r2flow.progress import Bar
 from r2flow.reports.outputs import write_samples
 from r2flow.runs.composing import compose
 from r2flow.samplers import build_sampler

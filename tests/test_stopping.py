@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from r2flow.errors import InputError
-from r2flow.signals import (
+from r2flow.base.errors import InputError
+from r2flow.base.signals import (
     STOPPING,
     Stopped,
     blocking_signals,
@@ -64,7 +64,7 @@ def test_told_to_stop_during_an_import(tmp_path: Path, command: str, argv: list[
 LOADER = """
 import os, time
 from torch.utils.data import DataLoader
-from r2flow.signals import end_with_parent
+from r2flow.base.signals import end_with_parent
 
 def big(item):
     open(f"pid-{os.getpid()}", "w").close()
@@ -117,7 +117,7 @@ def test_a_worker_does_not_hear_what_its_run_ignores(monkeypatch):
 
 WORKERS = """
 import functools, os, signal, sys, types
-from r2flow.signals import Stopped, handling_signals, stop_at_once
+from r2flow.base.signals import Stopped, handling_signals, stop_at_once
 from r2flow.store import Store
 
 if __name__ != "__main__":

@@ -14,9 +14,9 @@ from r2flow.callbacks import Stopping
 from r2flow.callbacks.progress import Progress
 
 import r2flow.training
-from r2flow.errors import InputError
-from r2flow.progress import Bar, track
-from r2flow.signals import LATER, Stopped
+from r2flow.base.errors import InputError
+from r2flow.base.progress import Bar, track
+from r2flow.base.signals import LATER, Stopped
 from tests.conftest import CONFIG, make_stage
 from tests.training.conftest import scans, tiny  # noqa: F401  a fixture
 
@@ -92,7 +92,7 @@ def test_a_bar_goes_to_standard_error_with_count_unit_and_note(capsys, monkeypat
 
 def test_without_a_terminal_there_is_a_line_every_half_minute(capsys, monkeypatch):
     now = 100.0
-    monkeypatch.setattr("r2flow.progress.time.monotonic", lambda: now)
+    monkeypatch.setattr("r2flow.base.progress.time.monotonic", lambda: now)
     with Bar("completing", 300, "scans") as bar:
         bar.set(100)  # of an earlier run
         for _ in range(8):
@@ -110,7 +110,7 @@ def test_the_first_process_of_a_training_writes_its_losses_and_scans_per_second(
     capsys, monkeypatch, first
 ):
     now = 100.0
-    monkeypatch.setattr("r2flow.progress.time.monotonic", lambda: now)
+    monkeypatch.setattr("r2flow.base.progress.time.monotonic", lambda: now)
     data = SimpleNamespace(batch_size=4)
     trainer: Any = SimpleNamespace(
         max_steps=17, global_step=10, is_global_zero=first, datamodule=data
@@ -136,7 +136,7 @@ def test_the_first_process_of_a_training_writes_its_losses_and_scans_per_second(
 def test_several_processes_write_lines_on_a_terminal_too(capsys, monkeypatch, total, left):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
     now = 100.0
-    monkeypatch.setattr("r2flow.progress.time.monotonic", lambda: now)
+    monkeypatch.setattr("r2flow.base.progress.time.monotonic", lambda: now)
     with Bar("process 2 of 8: drawing", total, "pairs", lines=True) as bar:
         for done in (16, 32):
             now += 40.0
@@ -170,7 +170,7 @@ def test_work_goes_on_where_standard_error_was_closed(monkeypatch):
 BLOCK, TIMES = 64 << 20, 8
 PROGRAM = f"""
 import resource
-from r2flow.memory import prepare_process
+from r2flow.base.memory import prepare_process
 
 prepare_process()
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt

@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from r2flow.base.registry import Portion
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.flow.losses import LOSSES, absolute
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
-from r2flow.registry import Portion
 from r2flow.stages import STAGES
 from r2flow.stages.base import Batch
 from r2flow.stages.flow_map import LearnFlowMap

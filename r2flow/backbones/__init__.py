@@ -10,9 +10,9 @@ from r2flow.backbones.efficient_unet import EfficientUNet
 from r2flow.backbones.hdit import HDiT
 from r2flow.backbones.local import Local
 from r2flow.backbones.vit import ViT
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Config, Options, Registry, presets
 from r2flow.lidar.sensors import SENSORS
-from r2flow.registry import Config, Options, Registry, presets
 
 
 class _Backbones(Registry[type[Backbone]]):

@@ -21,8 +21,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from r2flow.backbones.layers import rows_at_once
-from r2flow.errors import InputError
-from r2flow.registry import Registry
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Registry
 
 # limit of torch.compile's graphs of flex_attention; three levels exceed its default of 8
 _GRAPHS = 64

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.backbones.layers import ExactBuffers, at_least_float32
-from r2flow.errors import InputError
-from r2flow.registry import Positive
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Positive
 
 Prediction = Literal["velocity", "data", "noise"]
 

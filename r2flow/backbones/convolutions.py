@@ -19,7 +19,7 @@ from r2flow.backbones.layers import (
     wrapped,
     zero_initialised,
 )
-from r2flow.registry import Bound, Count, Portion, Positive
+from r2flow.base.registry import Bound, Count, Portion, Positive
 
 TimeChannels = Annotated[int, Bound("even and at least 4", lambda n: n >= 4 and n % 2 == 0)]
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.backbones.layers import ExactBuffers
-from r2flow.registry import Registry
+from r2flow.base.registry import Registry
 
 
 class Rotary(ExactBuffers):

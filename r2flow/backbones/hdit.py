@@ -21,8 +21,8 @@ from r2flow.backbones.layers import (
     zero_initialised,
 )
 from r2flow.backbones.transformer import Block, BlockOptions, Expand, Neighbourhood, merge
-from r2flow.errors import InputError
-from r2flow.registry import Count, Portion
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Count, Portion
 
 
 class HDiT(Backbone):

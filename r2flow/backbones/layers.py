@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 
 Layer = TypeVar("Layer", bound=nn.Module)
 

@@ -17,7 +17,7 @@ from r2flow.backbones.layers import (
     unshuffle,
     zero_initialised,
 )
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 
 
 class Neighbourhood(NamedTuple):

@@ -12,7 +12,7 @@ from r2flow.backbones.encodings import FourierFeatures
 from r2flow.backbones.hdit import RayFeatures, time_embedding
 from r2flow.backbones.layers import ExactLinear, RMSNorm, uncast, unshuffle, zero_initialised
 from r2flow.backbones.transformer import Block, BlockOptions
-from r2flow.registry import Count, Natural, Portion
+from r2flow.base.registry import Count, Natural, Portion
 
 
 class ViT(Backbone):

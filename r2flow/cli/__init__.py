@@ -3,8 +3,8 @@
 import sys
 from collections.abc import Sequence
 
-from r2flow.memory import prepare_process
-from r2flow.signals import handling_signals_of_program
+from r2flow.base.memory import prepare_process
+from r2flow.base.signals import handling_signals_of_program
 
 
 def main(*verb: str, command: Sequence[str] = ("-m", "r2flow", "train")) -> None:

@@ -6,10 +6,10 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
+from r2flow.base.devices import choose_device
+from r2flow.base.errors import check_folder
 from r2flow.cli.app import app
 from r2flow.cli.options import SETS, DeviceOption, OutOption, parse_counts, several
-from r2flow.devices import choose_device
-from r2flow.errors import check_folder
 
 _UNITS = {"": 1, "s": 1, "min": 60, "h": 3600}
 
@@ -58,13 +58,13 @@ def ablate(
 
     The same command resumes. trainer.max_steps=N compares at equal steps instead.
     """
+    from r2flow.base.progress import track
+    from r2flow.base.signals import LATER
     from r2flow.data.opening import open_scans, reading_for
     from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.progress import track
     from r2flow.reports.ablation import ablation_page, measure_run, print_ablation, write_csv
     from r2flow.reports.pages import write_page
     from r2flow.runs.ablation import Ablation, training_cost
-    from r2flow.signals import LATER
 
     where = choose_device(device)
     check_folder(out)

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 from typer import Argument, Option
 
+from r2flow.base.errors import InputError
 from r2flow.cli.app import app
 from r2flow.cli.options import (
     ColumnsOption,
@@ -25,7 +26,6 @@ from r2flow.cli.options import (
     grouped,
     several,
 )
-from r2flow.errors import InputError
 
 _log = logging.getLogger(__name__)
 
@@ -45,8 +45,8 @@ def simulate(
     workers: WorkersOption = None,
 ) -> None:
     """Simulate scans of street scenes. The same command resumes an interrupted run."""
+    from r2flow.base.progress import Bar
     from r2flow.lidar.sensors import named_sensor
-    from r2flow.progress import Bar
     from r2flow.simulator.folder import SimulatedFolder
 
     formats = tuple(dict.fromkeys(format.split(",")))
@@ -134,11 +134,11 @@ def sensor(
     Pass the file to other verbs (--sensor mine.yaml), or place it in conf/sensor/ for train.py
     (sensor=mine).
     """
+    from r2flow.base.progress import track
     from r2flow.data.sources import warn_of_frame
     from r2flow.lidar.estimation import estimate_sensor, nearest_sensor
     from r2flow.lidar.scan_files import points_beside, read_points
     from r2flow.lidar.sensors import ENDINGS, SENSORS, write_sensor
-    from r2flow.progress import track
     from r2flow.reports.tables import print_table
     from r2flow.reports.view.panels import list_scans
 
@@ -203,9 +203,9 @@ def unpack(
     The time is header.stamp, if 0 that of recording. The files contain x, y, z and, if present,
     intensity and ring.
     """
+    from r2flow.base.progress import track
     from r2flow.lidar.bags import read_bag
     from r2flow.lidar.scan_files import read_points, write_points
-    from r2flow.progress import track
 
     stamps = Counter[int]()
     messages = track(read_bag(recording, topic, columns), "unpacking", "scans", most or 0)

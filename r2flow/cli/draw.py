@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from typer import Argument, Option
 
+from r2flow.base.devices import choose_device
+from r2flow.base.errors import InputError, check_folder
 from r2flow.cli.app import app
 from r2flow.cli.options import (
     SETS,
@@ -23,8 +25,6 @@ from r2flow.cli.options import (
     grouped,
     several,
 )
-from r2flow.devices import choose_device
-from r2flow.errors import InputError, check_folder
 
 if TYPE_CHECKING:
     from r2flow.data.partial import PartialScan
@@ -84,7 +84,7 @@ def sample(
     The default sampler is the generator's.
     """
     from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.models import DEFAULT, find_model
+    from r2flow.model.shipped import DEFAULT, find_model
     from r2flow.reports.outputs import write_samples
 
     check_folder(out)
@@ -115,7 +115,7 @@ def sample(
 
 
 def _print_model(name: str) -> None:
-    from r2flow.models import MODELS
+    from r2flow.model.shipped import MODELS
 
     print(f"the model {name}: {MODELS[name].about} (r2flow info {name})")
 
@@ -155,8 +155,8 @@ def interpolate(
     Default solver: dopri5 with tolerance 1e-4; with --steps or --grid, the flow's own.
     """
     from r2flow.generators.flow import as_flow, ode_sampler
-    from r2flow.inversion import real_scans
     from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.model.inversion import real_scans
     from r2flow.reports.interpolation import interpolation
     from r2flow.reports.pages import write_page
     from r2flow.samplers import Adaptive, build_sampler
@@ -227,7 +227,7 @@ class PartialOptions:
         """
         from r2flow.lidar.sensors import named_sensor
         from r2flow.model.checkpoint import load_checkpoint
-        from r2flow.models import DENSIFY
+        from r2flow.model.shipped import DENSIFY
 
         loaded = load_checkpoint(model, choose_device(device))
         if self.to or self.size:
@@ -286,8 +286,8 @@ def complete(
     """
     from r2flow.lidar.known import mask_identity, parse_mask
     from r2flow.model.completion import completing, usual_precision
-    from r2flow.models import DEFAULT, DENSIFY
-    from r2flow.reports.completed import Job, lack_sectors, write_completed
+    from r2flow.model.shipped import DEFAULT, DENSIFY
+    from r2flow.reports.answers import Job, lack_sectors, write_completed
 
     check_folder(out)
     mask = parse_mask(given.mask) if given.mask else None

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument
 
+from r2flow.base.devices import choose_device
+from r2flow.base.errors import InputError, check_folder
 from r2flow.cli.app import app
 from r2flow.cli.options import SETS, ReadingOptions, grouped
 from r2flow.cli.sets import EvaluateOptions, judged_sets, open_set, possible_metrics, reading_of
-from r2flow.devices import choose_device
-from r2flow.errors import InputError, check_folder
 
 if TYPE_CHECKING:
     from r2flow.data.sets import ScanSet
@@ -41,7 +41,7 @@ def evaluate(
     Models are sampled; several --steps or --sampler plot distance against evaluations and seconds.
     The same command with --out resumes. Under torchrun, processes share the scans.
     """
-    from r2flow.processes import process_group
+    from r2flow.base.processes import process_group
 
     named = list(dict.fromkeys(generated or []))
     if not (named or options.reference or options.baselines):
@@ -53,6 +53,7 @@ def evaluate(
 def _evaluate(
     real: str, named: Sequence[str], options: EvaluateOptions, how: ReadingOptions, device: str
 ) -> None:
+    from r2flow.base.processes import rank_and_world_size
     from r2flow.evaluation.comparing import Comparer, pairs_of, with_equal_panels
     from r2flow.evaluation.copies import find_nearest, with_copies
     from r2flow.evaluation.measuring import Cache, Work, check_reflectance
@@ -60,7 +61,6 @@ def _evaluate(
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.metrics import METRICS
     from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.processes import rank_and_world_size
 
     rules = PROTOCOLS[options.protocol]
     chosen: dict[str, Any] = {}

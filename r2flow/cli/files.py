@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 
 from typer import Argument, Option
 
+from r2flow.base.errors import InputError, check_folder
 from r2flow.cli.app import app
 from r2flow.cli.options import ModelArgument, SamplerOptions, grouped
-from r2flow.errors import InputError, check_folder
 
 
 @app.command(
@@ -100,7 +100,7 @@ def info(
     r2flow does not download networks: get the published file, then --add it. It is loaded as
     tensors only, checked and stored in R2FLOW_WEIGHTS (default ~/.cache/r2flow/weights).
     """
-    from r2flow.config import flatten
+    from r2flow.base.config import flatten
     from r2flow.metrics.extractors.base import add as install
     from r2flow.metrics.extractors.base import kept_file
     from r2flow.reports.contents import describe, print_known

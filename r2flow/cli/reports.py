@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option
 
+from r2flow.base.devices import choose_device
+from r2flow.base.errors import InputError, check_folder
 from r2flow.cli.app import app, report
 from r2flow.cli.options import (
     SETS,
@@ -26,8 +28,6 @@ from r2flow.cli.options import (
     grouped,
     parse_counts,
 )
-from r2flow.devices import choose_device
-from r2flow.errors import InputError, check_folder
 
 if TYPE_CHECKING:
     from r2flow.model.checkpoint import Checkpoint
@@ -55,9 +55,9 @@ def curvature(
     """Measure the straightness s(t) of trained flows; plot paths of the most curved pixels (the
     paper's figure 8).
     """
+    from r2flow.base.progress import Bar
     from r2flow.generators import as_flow
     from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.progress import Bar
     from r2flow.reports.curvature import curvature_page, measure_paths
 
     where = choose_device(draw.device)
@@ -106,9 +106,9 @@ def solvers(
     """
     import time
 
+    from r2flow.base.progress import Bar
     from r2flow.flow.problems import PROBLEMS
     from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.progress import Bar
     from r2flow.reports import solvers as measuring
     from r2flow.reports.savings import savings
 
@@ -169,8 +169,8 @@ def backbones(
     table II).
     """
     from r2flow.backbones import configurations
+    from r2flow.base.progress import track
     from r2flow.lidar.sensors import named_sensor
-    from r2flow.progress import track
     from r2flow.reports.backbones import backbone_costs, print_costs
 
     chosen = named_sensor(sensor, size)
@@ -210,10 +210,10 @@ def completion(
     out: OutOption = Path("reports"),
 ) -> None:
     """Mask scans and complete them by models and by interpolation: errors against evaluations."""
-    from r2flow.inversion import real_scans
+    from r2flow.base.progress import Bar
     from r2flow.model.completion import completing
-    from r2flow.models import DENSIFY
-    from r2flow.progress import Bar
+    from r2flow.model.inversion import real_scans
+    from r2flow.model.shipped import DENSIFY
     from r2flow.reports.completion import TASKS, completion_page, completion_rows, kept_rays
 
     where = choose_device(device)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from typer import Option
 
+from r2flow.base.errors import InputError
 from r2flow.cli.options import (
     SETS,
     BatchOption,
@@ -21,7 +22,6 @@ from r2flow.cli.options import (
     StepsList,
     ToleranceOption,
 )
-from r2flow.errors import InputError
 
 if TYPE_CHECKING:
     from r2flow.data.reading import Reading
@@ -161,8 +161,8 @@ def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[
 
     Of several samplers, each receives only the options that it has.
     """
+    from r2flow.base.registry import options_of
     from r2flow.evaluation.sets import sampled_set
-    from r2flow.registry import options_of
     from r2flow.samplers import SAMPLERS, parse_sampler, split_samplers
 
     generator = flow.generator

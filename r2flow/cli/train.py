@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 from typer import Option
 
+from r2flow.base.devices import choose_device
 from r2flow.cli.app import app
 from r2flow.cli.options import (
     BatchOption,
@@ -18,7 +19,6 @@ from r2flow.cli.options import (
     grouped,
     several,
 )
-from r2flow.devices import choose_device
 
 
 @app.command(
@@ -64,10 +64,10 @@ def pairs(
     """
     import torch
 
+    from r2flow.base.registry import construct
     from r2flow.data.options import PairOptions
     from r2flow.data.pairs import PairStore, default_folder, make_pairs
     from r2flow.model.lineage import find_parent
-    from r2flow.registry import construct
 
     where = choose_device(device)
     if where == "cuda":  # SLURM may expose one GPU per task

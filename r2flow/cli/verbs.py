@@ -10,9 +10,7 @@ from typing import Any
 import typer
 
 from r2flow import __version__
-from r2flow.cli import ablate, data, draw, evaluate, files, reports, train, view  # noqa: F401 (each registers its verbs)
-from r2flow.cli.app import app
-from r2flow.errors import (
+from r2flow.base.errors import (
     InputError,
     PlainFormatter,
     Unbroken,
@@ -20,8 +18,10 @@ from r2flow.errors import (
     one_line,
     open_streams,
 )
-from r2flow.plugins import load_plugins, take_plugins
-from r2flow.signals import Stopped, handling_signals, stop_at_once
+from r2flow.base.plugins import load_plugins, take_plugins
+from r2flow.base.signals import Stopped, handling_signals, stop_at_once
+from r2flow.cli import ablate, data, draw, evaluate, files, reports, train, view  # noqa: F401 (each registers its verbs)
+from r2flow.cli.app import app
 
 # ClickException: in click for older releases of typer, in typer for newer ones.
 USAGE_ERROR: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
@@ -89,7 +89,7 @@ def run(arguments: Sequence[str], command: Sequence[str]) -> int:
 
 def _verb_of_model(text: str) -> str:
     """Advice for a model's name in the place of a verb."""
-    from r2flow.models import DENSIFY, MODELS
+    from r2flow.model.shipped import DENSIFY, MODELS
 
     for name in MODELS:
         if f"command '{name}'" in text:

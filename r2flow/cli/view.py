@@ -11,6 +11,8 @@ from typing import Annotated, Literal
 
 from typer import Argument, Option
 
+from r2flow.base.devices import choose_device
+from r2flow.base.errors import InputError
 from r2flow.cli.app import app
 from r2flow.cli.options import (
     SETS,
@@ -22,8 +24,6 @@ from r2flow.cli.options import (
     StepsList,
     grouped,
 )
-from r2flow.devices import choose_device
-from r2flow.errors import InputError
 
 _SCANS = 16  # default number of scans per folder
 _SAMPLES = 4  # default number of samples per generator
@@ -54,8 +54,8 @@ def show(
     """Draw each scan (range, reflectance, bird's-eye view, perspective) as a PNG or PDF, or write
     range images.
     """
+    from r2flow.base.files import save_array
     from r2flow.data.opening import describe
-    from r2flow.files import save_array
     from r2flow.reports.pictures import STREET, save_figure, scan_figure
     from r2flow.reports.view.panels import scan_panels, share_scale
 
@@ -120,9 +120,9 @@ def view(
 
     The cursor links points and range image; labels next to the scans are shown.
     """
+    from r2flow.base.files import write_file
     from r2flow.data.opening import describe
     from r2flow.evaluation.sets import is_checkpoint
-    from r2flow.files import write_file
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports.view import page
     from r2flow.reports.view.panels import as_frames, sample_panels, scan_panels, share_scale

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r2flow import noise
+from r2flow.base import noise
 
 
 @dataclass(frozen=True)

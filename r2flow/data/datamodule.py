@@ -13,6 +13,9 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
+from r2flow.base.errors import InputError
+from r2flow.base.registry import construct
+from r2flow.base.signals import init_loader_worker
 from r2flow.data.augment import Augmentation
 from r2flow.data.loader import (
     FlowDataset,
@@ -30,11 +33,8 @@ from r2flow.data.pairs import PairDataset, PairStore
 from r2flow.data.reading import AUTO, Reading
 from r2flow.data.resolving import lacking_reflectance, plan_data, reflectance_levels
 from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
-from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding, encoding_options
 from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
-from r2flow.registry import construct
-from r2flow.signals import init_loader_worker
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ class ScanDataModule(L.LightningDataModule):
     `r2flow.data.loader.FlowDataset` describes a batch. An epoch is a pass over the training scans,
     without those left over when they are shared in batches; test and prediction use the held-out
     scans. In a Trainer, scans have the encoding of the module's `item_format`, if it has one.
-    Noise, times and order derive from the seed (`r2flow.noise`).
+    Noise, times and order derive from the seed (`r2flow.base.noise`).
 
         data = ScanDataModule("kitti_raw", root="KITTI", sensor="hdl64e_small", batch_size=8)
 

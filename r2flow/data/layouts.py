@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from r2flow.base.errors import InputError, warn_odd
 from r2flow.data.options import SourceOptions
 from r2flow.data.reading import Reading, lacks_reflectance, leaving_out
 from r2flow.data.sources import ScanFiles, ScanSource, warn_of_other_sensor
-from r2flow.errors import InputError, warn_odd
 from r2flow.lidar.scan_files import (
     FIRM_ENDINGS,
     LOOSE_ENDINGS,

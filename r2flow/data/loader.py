@@ -10,13 +10,13 @@ from torch import Tensor
 from torch.utils.data import Dataset
 from torch.utils.data.distributed import DistributedSampler
 
-from r2flow import noise
+from r2flow.base import noise
+from r2flow.base.errors import InputError
+from r2flow.base.processes import rank_and_world_size
 from r2flow.data.augment import Augmentation
 from r2flow.data.sources import ScanSource
-from r2flow.errors import InputError
 from r2flow.lidar.encoding import FAR, Encoding, wrong_with
 from r2flow.lidar.sensors import Sensor
-from r2flow.processes import rank_and_world_size
 
 Item = dict[str, Tensor]
 # of x_1, (C, H, W), its sensor, the image's draws

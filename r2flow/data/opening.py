@@ -18,6 +18,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from r2flow.base.errors import InputError, check
+from r2flow.base.registry import Registry, did_you_mean
 from r2flow.data import layouts
 from r2flow.data.layouts import Drive, Layout, SourceKind
 from r2flow.data.options import FOLDER, PREPARED, SIMULATED, ReadingOptions, SourceOptions
@@ -32,11 +34,9 @@ from r2flow.data.sources import (
     mismatch_of,
     warn_of_other_sensor,
 )
-from r2flow.errors import InputError, check
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensors import SENSORS, Sensor, named_sensor
-from r2flow.models import MODELS
-from r2flow.registry import Registry, did_you_mean
+from r2flow.model.shipped import MODELS
 from r2flow.store import MANIFEST, manifest_of
 
 log = logging.getLogger(__name__)

@@ -7,11 +7,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Count, Natural, NonNegative, Portion, Positive, Seed, strict
 from r2flow.generators.base import Precision
 from r2flow.lidar.projection import Convention, Projection
 from r2flow.lidar.scan_files import check_columns
-from r2flow.registry import Count, Natural, NonNegative, Portion, Positive, Seed, strict
 from r2flow.samplers import build_sampler
 
 # names in `r2flow.data.opening.SOURCES`

@@ -13,17 +13,17 @@ from safetensors import safe_open
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from r2flow import noise
+from r2flow.base import noise
+from r2flow.base.errors import InputError, check
+from r2flow.base.files import reading_errors
+from r2flow.base.processes import rank_and_world_size
+from r2flow.base.progress import Bar
+from r2flow.base.signals import LATER, Stopped
 from r2flow.data.loader import FlowDataset, Item, Key, Permutations
 from r2flow.data.options import PairOptions
-from r2flow.errors import InputError, check
-from r2flow.files import reading_errors
 from r2flow.generators import Flow, Generator, as_flow
-from r2flow.models import name_of
-from r2flow.processes import rank_and_world_size
-from r2flow.progress import Bar
+from r2flow.model.shipped import name_of
 from r2flow.samplers import build_sampler
-from r2flow.signals import LATER, Stopped
 from r2flow.store import Damaged, Store
 
 

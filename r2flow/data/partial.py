@@ -11,13 +11,21 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from r2flow.base.errors import InputError, check, naming, warn_odd
 from r2flow.data.opening import Described, describe, open_scans
 from r2flow.data.options import FOLDER, PREPARED, SIMULATED
 from r2flow.data.reading import DIVIDED, Reading, nothing_in_view, scaled_reflectance
 from r2flow.data.sources import LOOKED_AT, spread, warn_of_frame
-from r2flow.errors import InputError, check, naming, warn_odd
 from r2flow.lidar.encoding import FAR, wrong_with
 from r2flow.lidar.estimation import FULL_REFLECTANCE, SURE, full_reflectance, other_sensor
+from r2flow.lidar.other_sensors import (
+    Partial,
+    image_through,
+    points_of_same,
+    points_through,
+    rows_of,
+    sensor_of,
+)
 from r2flow.lidar.scan_files import (
     Points,
     points_beside,
@@ -27,14 +35,6 @@ from r2flow.lidar.scan_files import (
     scan_ending,
 )
 from r2flow.lidar.sensors import SENSORS, Sensor
-from r2flow.lidar.transfer import (
-    Partial,
-    image_through,
-    points_of_same,
-    points_through,
-    rows_of,
-    sensor_of,
-)
 
 # with less than this share of rays per column, pixels between the rays are not measured
 FEWER = 0.9

@@ -21,7 +21,10 @@ from typing import Any
 import numpy as np
 from safetensors import safe_open
 
-from r2flow.config import at_most_three, differences
+from r2flow.base.config import at_most_three, differences
+from r2flow.base.errors import InputError, check
+from r2flow.base.files import reading_errors
+from r2flow.base.progress import Bar, track
 from r2flow.data.layouts import Drive
 from r2flow.data.quantise import OTHER_LEVELS, find_levels, range_codes, reflectance_codes
 from r2flow.data.reading import Reading, lacks_reflectance, read_image
@@ -32,9 +35,6 @@ from r2flow.data.sources import (
     spread,
     warn_of_other_sensor,
 )
-from r2flow.errors import InputError, check
-from r2flow.files import reading_errors
-from r2flow.progress import Bar, track
 from r2flow.store import MANIFEST, Damaged, Store, checksum, read_manifest
 
 log = logging.getLogger(__name__)

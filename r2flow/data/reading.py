@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from r2flow.errors import InputError, naming, warn_odd
+from r2flow.base.errors import InputError, naming, warn_odd
 from r2flow.lidar.estimation import FULL_REFLECTANCE, OUTLIERS, SURE, full_reflectance
 from r2flow.lidar.labels import read_labels
 from r2flow.lidar.projection import Convention, Projection, project_indices, scatter

@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
+from r2flow.base.errors import InputError
+from r2flow.base.registry import construct
 from r2flow.data.opening import SOURCES, Described, Layout, Prepared
 from r2flow.data.options import (
     MIXED,
@@ -15,9 +17,7 @@ from r2flow.data.options import (
     ReadingOptions,
     SourceOptions,
 )
-from r2flow.errors import InputError
 from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
-from r2flow.registry import construct
 
 Options = TypeVar("Options", bound=SourceOptions)
 

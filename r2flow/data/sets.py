@@ -9,10 +9,10 @@ from typing import Any
 from torch import Tensor
 from torch.utils.data import DataLoader, default_collate
 
+from r2flow.base.noise import generator
+from r2flow.base.signals import blocking_signals, init_loader_worker
 from r2flow.data.sources import ScanSource, drives_within, spread
 from r2flow.lidar.sensors import Sensor
-from r2flow.noise import generator
-from r2flow.signals import blocking_signals, init_loader_worker
 from r2flow.store import checksum
 
 

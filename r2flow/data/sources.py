@@ -21,14 +21,14 @@ import torch
 from torch import Tensor
 
 from r2flow import simulator
+from r2flow.base.errors import InputError, check, warn_odd
+from r2flow.base.files import cache_folder
+from r2flow.base.progress import track
 from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
-from r2flow.errors import InputError, check, warn_odd
-from r2flow.files import cache_folder
 from r2flow.lidar.estimation import Doubt, is_unclear, other_sensor
 from r2flow.lidar.scan_files import Points, read_points, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.turns import SEVERAL, turns
-from r2flow.progress import track
 from r2flow.store import MANIFEST, Damaged, Store, checksum, manifest_of
 
 log = logging.getLogger(__name__)

@@ -8,8 +8,11 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from r2flow.base.errors import InputError
+from r2flow.base.files import read_json, write_file
+from r2flow.base.plugins import plugin_digests
+from r2flow.base.processes import rank_and_world_size
 from r2flow.data.sets import ScanSet
-from r2flow.errors import InputError
 from r2flow.evaluation import measuring
 from r2flow.evaluation.measuring import (
     Cache,
@@ -23,10 +26,7 @@ from r2flow.evaluation.measuring import (
 )
 from r2flow.evaluation.protocols import Rules
 from r2flow.evaluation.sets import baseline_sets, reference_sets
-from r2flow.files import read_json, write_file
 from r2flow.metrics.panel import LACKING, PANEL, REFLECTANCE, mean_distance
-from r2flow.plugins import plugin_digests
-from r2flow.processes import rank_and_world_size
 from r2flow.store import checksum
 
 Kind = Literal["judged", "reference", "baseline"]

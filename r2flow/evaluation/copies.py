@@ -19,8 +19,8 @@ from scipy.stats import mannwhitneyu
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
+from r2flow.base.errors import InputError
 from r2flow.data.sets import ScanSet
-from r2flow.errors import InputError
 from r2flow.evaluation.comparing import Comparison, Comparisons
 from r2flow.evaluation.measuring import MetricResult, Work, bar
 from r2flow.evaluation.sets import HALVES

@@ -12,16 +12,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from r2flow.base.errors import InputError
+from r2flow.base.files import cache_folder
+from r2flow.base.plugins import plugin_digests
+from r2flow.base.processes import rank_and_world_size, sum_over_processes
+from r2flow.base.progress import Bar
 from r2flow.data.sets import ScanSet
-from r2flow.errors import InputError
 from r2flow.evaluation.protocols import R2FLOW, WORDS, Rules
 from r2flow.evaluation.sets import SampledScans
-from r2flow.files import cache_folder
 from r2flow.metrics.base import Protocol, ScanMetric
 from r2flow.metrics.scans import Scans
-from r2flow.plugins import plugin_digests
-from r2flow.processes import rank_and_world_size, sum_over_processes
-from r2flow.progress import Bar
 from r2flow.store import Damaged, Store, checksum
 
 log = logging.getLogger(__name__)

@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Registry
 from r2flow.data.opening import SOURCES
 from r2flow.data.sets import ScanSet, fixed_choice
-from r2flow.errors import InputError
 from r2flow.lidar.sensors import Convention, Rays
-from r2flow.registry import Registry
 
 WORDS = {
     "measured": "as measured",

@@ -10,9 +10,10 @@ import numpy as np
 from numpy import ndarray
 from torch import Tensor
 
+from r2flow.base.errors import InputError
+from r2flow.base.noise import generator, standard_normal
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import MadeScans
-from r2flow.errors import InputError
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.lidar.encoding import Encoding
@@ -21,8 +22,7 @@ from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.paths import checkpoints_of
 from r2flow.model.sampling import draw
 from r2flow.model.saving import weights_hash
-from r2flow.models import MODELS
-from r2flow.noise import generator, standard_normal
+from r2flow.model.shipped import MODELS
 
 AGAIN = 100  # largest half of the real scans for which a model is sampled again
 HALVES = "real halves"  # name of a reference

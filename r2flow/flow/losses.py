@@ -6,7 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from r2flow.registry import Registry
+from r2flow.base.registry import Registry
 
 Loss = Callable[[Tensor, Tensor], Tensor]
 

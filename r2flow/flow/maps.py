@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Options, Portion, Registry
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.solvers.fixed import build_grid
 from r2flow.flow.solvers.solution import selected
 from r2flow.flow.times import build_density
-from r2flow.registry import Options, Portion, Registry
 
 # u(t, x, s), in the argument order of backbones.
 MeanVelocity = Callable[[Tensor, Tensor, Tensor], Tensor]

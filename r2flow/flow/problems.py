@@ -14,8 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from r2flow.base.registry import Registry
 from r2flow.flow.path import expand_time
-from r2flow.registry import Registry
 
 
 class Problem(ABC):

@@ -12,9 +12,9 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Bound, Count, Options, Portion, Positive, Registry
 from r2flow.flow.solvers.fixed import build_grid
-from r2flow.registry import Bound, Count, Options, Portion, Positive, Registry
 
 _GOLDEN = -7046029254386353131  # (sqrt(5) - 1) / 2 of 2^64, as a signed integer
 _PLASTIC = -4521708957497675121, -7935046062780286180  # 1/p and 1/p^2 of 2^64, p^3 = p + 1

@@ -5,11 +5,11 @@ from typing import Any
 
 import torch
 
+from r2flow.base.registry import Registry, lazy
 from r2flow.generators.base import Condition, Generated, Generator, Sampler, condition_of
 from r2flow.generators.flow import USUAL, Flow, FlowMap, RectifiedFlow, as_flow
 from r2flow.generators.transfer import TransferFlow
 from r2flow.lidar.encoding import build_space
-from r2flow.registry import Registry, lazy
 
 __all__ = [
     "GENERATORS",

@@ -7,13 +7,13 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.noise import Draws
+from r2flow.base.registry import Config, options_of
 from r2flow.flow.solvers.solution import wide
 from r2flow.lidar.encoding import ModelSpace
 from r2flow.lidar.known import Ray
 from r2flow.lidar.region import Region
-from r2flow.noise import Draws
-from r2flow.registry import Config, options_of
 from r2flow.samplers import SAMPLERS, FixedSteps, build_sampler, parse_sampler
 from r2flow.samplers.base import Condition, Generated, Progress, Sampler
 

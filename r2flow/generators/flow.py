@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from r2flow.backbones import build_backbone
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.noise import Draws
 from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.solvers import Solution, Velocity, solve
 from r2flow.generators.base import Condition, Generator
 from r2flow.lidar.encoding import ModelSpace
 from r2flow.lidar.region import Region
-from r2flow.noise import Draws
 from r2flow.samplers import MMPS, FixedSteps, Jump, ODESampler, Sampler
 
 # Default of a new flow.

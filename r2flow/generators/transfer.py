@@ -11,7 +11,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from r2flow.backbones import build_backbone
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.processes import mean_over_processes
+from r2flow.base.registry import NonNegative
 from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.path import expand_time
 from r2flow.flow.solvers.solution import wide
@@ -32,8 +34,6 @@ from r2flow.generators.surroundings import (
     within_reach,
 )
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.processes import mean_over_processes
-from r2flow.registry import NonNegative
 from r2flow.samplers import Jump
 
 _LAST = 1e-5  # smallest 1 - t that the velocity is divided by

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from r2flow.errors import InputError, require
-from r2flow.files import reading_errors
+from r2flow.base.errors import InputError, require
+from r2flow.base.files import reading_errors
 from r2flow.lidar.scan_files.points import Points, column_points, renamed, warn_of_unused
 
 _CLOUD = "sensor_msgs/PointCloud2"

@@ -9,7 +9,7 @@ import numpy as np
 from numpy import ndarray
 from scipy.ndimage import fourier_gaussian, median
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.scan_files import Points
 from r2flow.lidar.unfolding import (
     FEWEST,

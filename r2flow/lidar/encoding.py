@@ -11,15 +11,15 @@ import torch
 from numpy import ndarray
 from torch import Tensor
 
-from r2flow.lidar.projection import image_to_points
-from r2flow.lidar.sensors import Sensor, build_sensor
-from r2flow.registry import (
+from r2flow.base.registry import (
     Bound,
     Registry,
     construct,
     options_of,
     presets,
 )
+from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.sensors import Sensor, build_sensor
 
 LIMIT_TOLERANCE = 1e-5  # relative, of closed range limits in decoding, for float32's rounding
 FULL = 1 + 1e-3  # maximum reflectance; larger values mean another scale

@@ -10,7 +10,7 @@ import numpy as np
 from numpy import ndarray
 from numpy.lib.stride_tricks import sliding_window_view
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.beams import Beams, NoBeamsError, find_beams
 from r2flow.lidar.scan_files import FARTHEST_RAY, Points
 from r2flow.lidar.sensors import SENSORS, Sensor

@@ -16,11 +16,11 @@ import torch
 from numpy import ndarray
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Count, Natural, Registry, Share, construct
 from r2flow.lidar.interpolation import nearest_known
 from r2flow.lidar.region import region
 from r2flow.lidar.scan_files import read_numbers
-from r2flow.registry import Count, Natural, Registry, Share, construct
 
 
 class Ray(IntEnum):

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 
-from r2flow.errors import InputError
-from r2flow.files import reading
+from r2flow.base.errors import InputError
+from r2flow.base.files import reading
 from r2flow.lidar.scan_files import LARGEST_FILE, TABLE_ENDINGS, Points, pandaset
 
 # SemanticKITTI's ids: name, and the colour in pictures (ground grey to violet, vehicles blue,

@@ -11,8 +11,8 @@ import torch
 from numpy import ndarray
 from torch import Tensor
 
-from r2flow.errors import InputError
-from r2flow.files import save_array
+from r2flow.base.errors import InputError
+from r2flow.base.files import save_array
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.scan_files.points import check_xyz
 from r2flow.lidar.sensors import Convention, Sensor, named_sensor

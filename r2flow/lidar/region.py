@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 
 # Degrees next to a sector that `r2flow sample` generates and crops. With the demo's 1-RF, the
 # distance of a 90-degree sector from the whole scan in model space is 0.065 without margin, 0.015

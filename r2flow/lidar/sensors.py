@@ -14,9 +14,9 @@ import yaml
 from numpy import ndarray
 from torch import Tensor
 
-from r2flow.errors import InputError
-from r2flow.files import reading, write_file
-from r2flow.registry import Registry, check_options, construct, options_of
+from r2flow.base.errors import InputError
+from r2flow.base.files import reading, write_file
+from r2flow.base.registry import Registry, check_options, construct, options_of
 
 Rays = Literal["centre", "reference"]
 Convention = Literal[Rays, "lidargen", "lidm"]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy import ndarray
 from scipy import ndimage
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.sensors import Convention, Sensor
 
 NOISE = 0.1  # degrees by which a laser may lie above that of the row before it in any case

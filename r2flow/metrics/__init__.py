@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from r2flow.base.registry import Registry, lazy
 from r2flow.metrics.extractors import EXTRACTORS
-from r2flow.registry import Registry, lazy
 
 if TYPE_CHECKING:
     from r2flow.metrics.base import ScanMetric

@@ -10,10 +10,10 @@ from numpy import ndarray
 from torch import Tensor
 from torchmetrics import Metric
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.processes import rank_and_world_size
 from r2flow.lidar.sensors import Sensor, named_sensor
 from r2flow.metrics.scans import MASK, Scans
-from r2flow.processes import rank_and_world_size
 
 SIDES = ("real", "generated")
 Figures = dict[str, float]  # values by name

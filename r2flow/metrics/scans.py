@@ -9,7 +9,7 @@ import torch
 from numpy import ndarray
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.encoding import wrong_with
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import Rays, Sensor

@@ -13,12 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from r2flow.base.errors import IN_MEMORY, InputError, check, naming
+from r2flow.base.files import reading_errors
+from r2flow.base.plugins import made_with
 from r2flow.data.opening import Described, describe, reading_for
 from r2flow.data.options import FOLDER as PLAIN
 from r2flow.data.options import SourceOptions
 from r2flow.data.partial import PartialScan, Sight, open_partial, sight
-from r2flow.errors import IN_MEMORY, InputError, check, naming
-from r2flow.files import reading_errors
 from r2flow.generators import Generator, TransferFlow, build_generator
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import Points, points_in_memory
@@ -30,7 +31,6 @@ from r2flow.model.published import FORMATS
 from r2flow.model.sampling import sample
 from r2flow.model.saving import save_checkpoint
 from r2flow.model.tensor_files import is_dense, read_checkpoint, read_safetensors
-from r2flow.plugins import made_with
 from r2flow.samplers import build_sampler
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from r2flow.devices import multiplies_bfloat16
-from r2flow.errors import InputError, check
+from r2flow.base.devices import multiplies_bfloat16
+from r2flow.base.errors import InputError, check
 from r2flow.generators import Flow, Generator, Sampler, TransferFlow, condition_of
 from r2flow.generators.base import Precision, Progress
 from r2flow.lidar.encoding import LIMIT_TOLERANCE, wrong_with

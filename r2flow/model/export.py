@@ -20,15 +20,15 @@ import torch
 from torch import Tensor, nn
 
 from r2flow import __version__
-from r2flow.errors import InputError, require
-from r2flow.files import write_file
+from r2flow.base.errors import InputError, require
+from r2flow.base.files import write_file
+from r2flow.base.noise import Draws
+from r2flow.base.registry import Registry
 from r2flow.generators import USUAL, RectifiedFlow, Sampler
 from r2flow.lidar.encoding import ModelSpace
 from r2flow.lidar.projection import unproject
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.saving import weights_hash
-from r2flow.noise import Draws
-from r2flow.registry import Registry
 
 NOTES = "r2flow.json"  # metadata file in a .pt2; an .onnx has the key `r2flow`
 

@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.backbones import BACKBONES
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Config, Options, options_of
 from r2flow.data.pairs import default_folder
 from r2flow.data.reading import AUTO
-from r2flow.errors import InputError
 from r2flow.generators import GENERATORS
 from r2flow.lidar.encoding import encoding_options
 from r2flow.lidar.sensors import sensor_options
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.model.saving import weights_hash
-from r2flow.models import name_of
-from r2flow.registry import Config, Options, options_of
+from r2flow.model.shipped import name_of
 
 # The default of each group, and the function that completes its options.
 _GROUPS: dict[str, tuple[str, Callable[[Any], Config]]] = {

@@ -1,6 +1,6 @@
 """Parts of a checkpoint: their keys, and the config in its hyper-parameters."""
 
-from r2flow.registry import Config, Options
+from r2flow.base.registry import Config, Options
 
 PREFIX = "generator."  # of the generator's weights in a LightningModule
 COMPILED = "_orig_mod."  # in the names of the weights after torch.compile

@@ -3,9 +3,9 @@
 import re
 from pathlib import Path
 
-from r2flow.errors import InputError
-from r2flow.models import MODELS, find_model
-from r2flow.registry import did_you_mean
+from r2flow.base.errors import InputError
+from r2flow.base.registry import did_you_mean
+from r2flow.model.shipped import MODELS, find_model
 
 FOLDER = "checkpoints"
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from r2flow.registry import Config, Options, Registry, lazy
+from r2flow.base.registry import Config, Options, Registry, lazy
 
 BACKBONE = "backbone."  # prefix of a flow's network in the generator
 

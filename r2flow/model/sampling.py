@@ -10,11 +10,11 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError, check
+from r2flow.base.errors import InputError, check
+from r2flow.base.noise import Draws
 from r2flow.generators import Condition, Generator, Sampler
 from r2flow.generators.base import Precision, Progress
 from r2flow.lidar.region import Region
-from r2flow.noise import Draws
 
 log = logging.getLogger(__name__)
 

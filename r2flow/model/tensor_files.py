@@ -13,10 +13,10 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
-from r2flow.config import check_tree
-from r2flow.errors import InputError
-from r2flow.files import reading_errors
-from r2flow.hashing import state_hash
+from r2flow.base.config import check_tree
+from r2flow.base.errors import InputError
+from r2flow.base.files import reading_errors
+from r2flow.base.hashing import state_hash
 from r2flow.model.parts import HYPER, NOTES
 from r2flow.model.published import inert, plain
 

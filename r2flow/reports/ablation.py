@@ -20,12 +20,13 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from r2flow.base.files import read_json, write_file
+from r2flow.base.noise import Draws
 from r2flow.data.sets import ScanSet
 from r2flow.evaluation.comparing import Comparer
 from r2flow.evaluation.measuring import Work
 from r2flow.evaluation.protocols import PROTOCOLS
 from r2flow.evaluation.sets import sampled_set
-from r2flow.files import read_json, write_file
 from r2flow.flow.path import interpolate
 from r2flow.flow.straightness import straightness
 from r2flow.generators import Flow, as_flow
@@ -33,7 +34,6 @@ from r2flow.metrics import METRICS
 from r2flow.metrics.things import LINES
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.model.saving import weights_hash
-from r2flow.noise import Draws
 from r2flow.reports.backbones import cost
 from r2flow.reports.pages import Page, Plot, lines_figure
 from r2flow.reports.tables import Row, shown, table

@@ -15,7 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from r2flow.backbones import Backbone, build_backbone, configurations
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.sensors import Sensor
 from r2flow.reports.tables import Row, print_table

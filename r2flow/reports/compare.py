@@ -9,7 +9,7 @@ from statistics import fmean, stdev
 
 from matplotlib.figure import Figure
 
-from r2flow.config import flatten, learned
+from r2flow.base.config import flatten, learned
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.reports.outputs import what_next, write_samples
 from r2flow.reports.pages import Page, write_page

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from numpy import ndarray
 
-from r2flow import noise
-from r2flow.errors import InputError
+from r2flow.base import noise
+from r2flow.base.errors import InputError
 from r2flow.generators import Sampler
 from r2flow.generators.base import Progress
 from r2flow.lidar.interpolation import Rule, interpolated

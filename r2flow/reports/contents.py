@@ -6,7 +6,7 @@ from typing import Any
 from r2flow.metrics import FIELD_NAMES
 from r2flow.metrics.extractors.base import SOURCES, kept, weights_folder
 from r2flow.model.checkpoint import load_checkpoint
-from r2flow.models import MODELS, name_of
+from r2flow.model.shipped import MODELS, name_of
 from r2flow.reports.tables import print_table
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
+from r2flow.base.noise import Draws
 from r2flow.flow.straightness import Straightness, straightness
 from r2flow.generators import as_flow
 from r2flow.generators.base import Progress
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.noise import Draws
 from r2flow.reports.pages import Page, Plot, blank_figure, lines_figure
 from r2flow.reports.tables import Row, short_names, table
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 from torch import Tensor
 
+from r2flow.base.progress import Bar
 from r2flow.data.sources import spread
 from r2flow.generators import Sampler
-from r2flow.inversion import interpolate_scans, round_trip
 from r2flow.lidar.projection import write_scan
 from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.inversion import interpolate_scans, round_trip
 from r2flow.model.sampling import warn_unsolved
-from r2flow.progress import Bar
 from r2flow.reports.pages import Page
 from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.tables import table

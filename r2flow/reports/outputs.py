@@ -11,9 +11,10 @@ import torch
 from numpy import ndarray
 from torch import Tensor
 
-from r2flow.config import as_override
+from r2flow.base.config import as_override
+from r2flow.base.errors import InputError
+from r2flow.base.progress import Bar, track
 from r2flow.data.opening import reading_for
-from r2flow.errors import InputError
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.lidar.projection import write_scan
@@ -22,7 +23,6 @@ from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.paths import title_of
 from r2flow.model.sampling import draw, warn_unsolved
 from r2flow.model.saving import weights_hash
-from r2flow.progress import Bar, track
 from r2flow.reports.pictures import contact_sheet, save_figure, scan_figure
 from r2flow.reports.view import Panel, most_images, write_viewer
 from r2flow.store import MANIFEST, FileStore, read_manifest

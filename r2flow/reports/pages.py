@@ -18,7 +18,7 @@ import torch
 from matplotlib.figure import Figure
 
 import r2flow
-from r2flow.files import write_file
+from r2flow.base.files import write_file
 from r2flow.reports.pictures import save_figure
 from r2flow.reports.tables import Row, words
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import yaml
 from matplotlib.figure import Figure
 
+from r2flow.base.errors import InputError
+from r2flow.base.files import read_json
+from r2flow.base.progress import track
 from r2flow.data.sets import ScanSet
-from r2flow.errors import InputError
-from r2flow.files import read_json
 from r2flow.generators import Flow
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.saving import weights_hash
-from r2flow.progress import track
 from r2flow.reports.backbones import cost
 from r2flow.reports.curvature import (
     curvature_figure,

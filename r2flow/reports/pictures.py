@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from torch import Tensor
 
-from r2flow.errors import printable
-from r2flow.files import atomic_write
+from r2flow.base.errors import printable
+from r2flow.base.files import atomic_write
 from r2flow.lidar.labels import CLASSES
 from r2flow.lidar.projection import image_to_points
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
 
-from r2flow.errors import InputError, naming
+from r2flow.base.errors import InputError, naming
+from r2flow.base.plugins import made_with
 from r2flow.model.paths import checkpoints_of, step_of
-from r2flow.plugins import made_with
 from r2flow.reports.backbones import cost
 from r2flow.reports.tables import Row, short_names
 from r2flow.reports.training import CURVES, Curve, read_curves

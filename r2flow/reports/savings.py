@@ -6,12 +6,12 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.noise import Draws
 from r2flow.flow.solvers import TORCHDIFFEQ, solve
 from r2flow.generators import Flow, Generator, as_flow
 from r2flow.lidar.region import MARGIN, region
 from r2flow.model.sampling import evaluated_region
-from r2flow.noise import Draws
 from r2flow.reports.backbones import timed
 from r2flow.reports.tables import Row, table
 

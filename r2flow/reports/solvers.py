@@ -15,6 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.base.noise import Draws
+from r2flow.base.plugins import loaded_plugins
 from r2flow.flow.problems import PROBLEMS
 from r2flow.flow.solvers import (
     SOLVERS,
@@ -27,11 +29,9 @@ from r2flow.flow.solvers import (
 )
 from r2flow.generators import as_flow
 from r2flow.generators.base import Progress
-from r2flow.inversion import metres_apart, rms
 from r2flow.lidar.encoding import Encoding
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.noise import Draws
-from r2flow.plugins import loaded_plugins
+from r2flow.model.inversion import metres_apart, rms
 from r2flow.reports.backbones import timed
 from r2flow.reports.pages import Page, Plot, lines_figure
 from r2flow.reports.savings import savings_text

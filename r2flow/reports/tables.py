@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from r2flow.errors import one_line
+from r2flow.base.errors import one_line
 
 Row = dict[str, Any]
 # Rows by key, with a heading for each key in order; or cells in order, with a heading for each.

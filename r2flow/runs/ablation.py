@@ -22,12 +22,12 @@ from hydra.core.override_parser.types import Override
 from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 
+from r2flow.base.config import override
+from r2flow.base.errors import InputError, naming
+from r2flow.base.files import read_json, write_file
 from r2flow.callbacks import ReflowPairs
-from r2flow.config import override
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.options import SIMULATED
-from r2flow.errors import InputError, naming
-from r2flow.files import read_json, write_file
 from r2flow.generators import as_flow
 from r2flow.model.paths import find_checkpoint
 from r2flow.model.tensor_files import read_checkpoint

@@ -14,17 +14,17 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import Checkpoint, ProgressBar
 from lightning.pytorch.utilities import rank_zero_only
 
+from r2flow.base.config import key_of
+from r2flow.base.errors import InputError, naming, one_line
+from r2flow.base.plugins import loaded_plugins, made_with
+from r2flow.base.registry import Bound, Config, Natural, Options, Seed, construct, strict
 from r2flow.callbacks import Progress, SamplePictures, build_callbacks
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.callbacks.loggers import LOGGERS, LearningRates
-from r2flow.config import key_of
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions
-from r2flow.errors import InputError, naming, one_line
 from r2flow.model.lineage import Parent, find_parent, model_options
 from r2flow.model.parts import MODEL, config_of
-from r2flow.plugins import loaded_plugins, made_with
-from r2flow.registry import Bound, Config, Natural, Options, Seed, construct, strict
 from r2flow.runs.folder import check_run, read_config
 from r2flow.stages import STAGES
 from r2flow.stages.base import Stage

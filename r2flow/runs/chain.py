@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from r2flow.config import flatten, key_of, links_of_key, override
-from r2flow.errors import InputError, naming
+from r2flow.base.config import flatten, key_of, links_of_key, override
+from r2flow.base.errors import InputError, naming
+from r2flow.base.registry import Config, Options
+from r2flow.base.signals import LATER, Stopped
 from r2flow.model.lineage import Parent
 from r2flow.model.paths import FOLDER
-from r2flow.registry import Config, Options
 from r2flow.runs.composing import compose
-from r2flow.signals import LATER, Stopped
 from r2flow.stages import STAGES
 from r2flow.training import build, check, fit
 

@@ -22,9 +22,9 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from r2flow.config import key_of, override
-from r2flow.errors import InputError
-from r2flow.registry import Config, did_you_mean, options_of
+from r2flow.base.config import key_of, override
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Config, did_you_mean, options_of
 
 T = TypeVar("T")
 

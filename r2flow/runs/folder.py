@@ -11,13 +11,13 @@ from typing import Any
 import yaml
 from filelock import FileLock, Timeout
 
-from r2flow.config import at_most_three, check_tree, differences, flatten, is_free
-from r2flow.errors import InputError, check
-from r2flow.files import write_file
+from r2flow.base.config import at_most_three, check_tree, differences, flatten, is_free
+from r2flow.base.errors import InputError, check
+from r2flow.base.files import write_file
+from r2flow.base.registry import Config, Options
 from r2flow.model.parts import HYPER, NOTES
 from r2flow.model.paths import FOLDER, checkpoints_of, step_of
 from r2flow.model.tensor_files import read_checkpoint
-from r2flow.registry import Config, Options
 
 log = logging.getLogger(__name__)
 

@@ -22,10 +22,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from r2flow.config import key_of, override
-from r2flow.errors import InputError
-from r2flow.plugins import load_plugins
-from r2flow.registry import Config, Options
+from r2flow.base.config import key_of, override
+from r2flow.base.errors import InputError
+from r2flow.base.plugins import load_plugins
+from r2flow.base.registry import Config, Options
+from r2flow.base.signals import LATER, STOPPING, Stopped, code_of, handling_signals, run_process
 from r2flow.runs.composing import (
     CONF,
     WRONG,
@@ -36,7 +37,6 @@ from r2flow.runs.composing import (
     register_resolver,
     with_choices,
 )
-from r2flow.signals import LATER, STOPPING, Stopped, code_of, handling_signals, run_process
 
 
 class JobEnded(RuntimeError):
@@ -227,7 +227,7 @@ def _chain(settings: Config, given: Sequence[str], folders: Sequence[str]) -> in
 
 def _draw_preview(model: str, out: Path) -> None:
     from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.models import find_model
+    from r2flow.model.shipped import find_model
     from r2flow.reports.outputs import write_samples
 
     picture = out / "samples.png"

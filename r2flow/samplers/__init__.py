@@ -12,9 +12,9 @@ from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Config, Options, Registry, lazy
 from r2flow.flow.solvers import SOLVERS, usual_grid
-from r2flow.registry import Config, Options, Registry, lazy
 from r2flow.samplers.base import Condition, Generated, Noise, OnGrid, Progress, Sampler, _plain
 from r2flow.samplers.maps import Jump, Refine, Renoise, Transport
 from r2flow.samplers.ode import Adaptive, FixedSteps, ODESampler, TorchDiffEq

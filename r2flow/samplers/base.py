@@ -8,10 +8,10 @@ from typing import Annotated, Any, Self
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Bound, Config, Options
 from r2flow.flow.solvers.fixed import build_grid
 from r2flow.flow.solvers.solution import finite, wide
-from r2flow.registry import Bound, Config, Options
 
 Condition = Mapping[str, Tensor]
 """Conditions of each scan by name: tensors of shape (B, ...)."""

@@ -7,11 +7,11 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
+from r2flow.base.registry import Bound, Count, NonNegative
 from r2flow.flow.maps import MeanVelocity, jump
 from r2flow.flow.solvers import solve
 from r2flow.flow.solvers.fixed import build_grid
 from r2flow.flow.solvers.solution import finite, stepped
-from r2flow.registry import Bound, Count, NonNegative
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, OnGrid, Sampler, Steps
 
 

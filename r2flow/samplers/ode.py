@@ -6,9 +6,9 @@ from typing import Any
 
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Config, Count, Portion, Positive
 from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, method_of, solve
-from r2flow.registry import Config, Count, Portion, Positive
 from r2flow.samplers.base import Call, Fresh, Generated, Given, OnGrid, Sampler
 
 

@@ -13,9 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Count, NonNegative
 from r2flow.flow.maps import MeanVelocity, jump
-from r2flow.registry import Count, NonNegative
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, Noise, OnGrid, Steps
 from r2flow.samplers.stochastic import SDE, back, sde
 

@@ -20,9 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
+from r2flow.base.registry import NonNegative, Portion
 from r2flow.flow.solvers.fixed import build_grid
 from r2flow.flow.solvers.solution import finite, stepped
-from r2flow.registry import NonNegative, Portion
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, Noise, OnGrid
 
 _Estimate = Callable[[Tensor, Tensor], Tensor]  # x_1hat(t, x_t) with t of shape ()

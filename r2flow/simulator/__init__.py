@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from r2flow.base.noise import generator
 from r2flow.lidar.sensors import Sensor, named_sensor
-from r2flow.noise import generator
 from r2flow.simulator.lasers import Rays, lasers_of
 from r2flow.simulator.raycast import cast
 from r2flow.simulator.returns import report

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from r2flow.errors import InputError
-from r2flow.files import atomic_write
+from r2flow.base.errors import InputError
+from r2flow.base.files import atomic_write
+from r2flow.base.registry import Registry
 from r2flow.lidar.projection import image_to_points, write_scan
 from r2flow.lidar.sensors import Sensor
-from r2flow.registry import Registry
 from r2flow.simulator import REVISION, simulate
 from r2flow.store import FileStore
 

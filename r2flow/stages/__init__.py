@@ -1,6 +1,6 @@
 """Registry of stages: LightningModules that train a generator."""
 
-from r2flow.registry import Registry, lazy
+from r2flow.base.registry import Registry, lazy
 from r2flow.stages.base import Stage
 from r2flow.stages.flow_map import LearnFlowMap
 from r2flow.stages.rectify import Distill, Rectify, Reflow

@@ -13,9 +13,13 @@ from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
+from r2flow.base.errors import InputError, naming
+from r2flow.base.noise import seed_torch
+from r2flow.base.plugins import loaded_plugins
+from r2flow.base.processes import average_gradients
+from r2flow.base.registry import Config, Natural, NonNegative, Options, Portion, Seed
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.loader import ItemFormat
-from r2flow.errors import InputError, naming
 from r2flow.flow.times import golden_sequence
 from r2flow.generators import Generator, build_generator
 from r2flow.lidar.encoding import Encoding, ModelSpace
@@ -26,10 +30,6 @@ from r2flow.model.lineage import Parent, find_parent, model_options, plain
 from r2flow.model.parts import COMPILED, MODEL, NOTES
 from r2flow.model.paths import step_of
 from r2flow.model.sampling import draw
-from r2flow.noise import seed_torch
-from r2flow.plugins import loaded_plugins
-from r2flow.processes import average_gradients
-from r2flow.registry import Config, Natural, NonNegative, Options, Portion, Seed
 from r2flow.samplers import build_sampler
 from r2flow.stages.muon import Muon
 
@@ -43,8 +43,8 @@ class Stage(L.LightningModule):
 
     A batch has the keys `x_1`, scans in model space, (B, C, H, W); `x_0`, noise, (B, *noise_shape);
     `u`, uniform draws in [0, 1), (B,); and `k`, the number of each image in the run, (B,), which
-    seeds further draws (`r2flow.noise`). Of a batch without noise, or scans alone, the others are
-    drawn by torch's global generator.
+    seeds further draws (`r2flow.base.noise`). Of a batch without noise, or scans alone, the others
+    are drawn by torch's global generator.
 
     A stage with several losses and optimisers sets `automatic_optimization = False`, creates the
     optimisers by `optimizers_for` and, in every `training_step`, calls `take_step(optimizer, loss)`

@@ -5,13 +5,13 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Positive, construct
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.errors import InputError
 from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, straight
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.times import plastic_sequence
 from r2flow.generators import FlowMap
-from r2flow.registry import Positive, construct
 from r2flow.samplers import Jump
 from r2flow.stages.base import Batch, Options
 from r2flow.stages.rectify import Reflow

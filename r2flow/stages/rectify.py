@@ -6,13 +6,13 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Count
 from r2flow.flow.losses import LOSSES, Loss
 from r2flow.flow.path import interpolate
 from r2flow.flow.times import build_density
 from r2flow.generators import Condition, Flow, Generator
 from r2flow.generators.flow import ode_sampler
-from r2flow.registry import Count
 from r2flow.samplers import FixedSteps
 from r2flow.stages.base import Batch, Options, SingleLoss
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.base.registry import Count, Portion, construct
 from r2flow.data.loader import ItemFormat
 from r2flow.generators import Generator, TransferFlow
 from r2flow.generators.base import IMAGE, KNOWN
@@ -18,7 +19,6 @@ from r2flow.lidar.encoding import ModelSpace
 from r2flow.lidar.known import Ray, every_row, random_points, random_rows
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.completion import complete
-from r2flow.registry import Count, Portion, construct
 from r2flow.stages.base import Batch, Options, SingleLoss
 
 

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from r2flow.backbones.attention import _Axis, _compiled_flex, _flex_mask, neighbourhood_attention
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 
 # (rows, columns, window): tiled evenly or not, rings narrower than the window, fewer rows than the
 # window

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from tiny_backbones import COLUMNS, NAMES, PUBLISHED, ROWS, image, tiny, untrained
 
 from r2flow.backbones import build_backbone, configurations
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.sensors import SENSORS, build_sensor
 from r2flow.reports.backbones import count_macs
 from tests.conftest import tiny_options

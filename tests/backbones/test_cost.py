@@ -7,7 +7,7 @@ from torch import nn
 
 from r2flow.backbones import build_backbone, configurations
 from r2flow.backbones.hdit import HDiT
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.sensors import SENSORS, build_sensor
 from r2flow.reports.backbones import backbone_costs, cost, count_macs, count_parameters
 from r2flow.runs.composing import compose

@@ -7,7 +7,7 @@ import torch
 from tiny_backbones import NAMES, PUBLISHED, rays
 
 from r2flow.backbones import BACKBONES, Backbone, build_backbone
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.region import Region
 from tests.conftest import tiny_options
 

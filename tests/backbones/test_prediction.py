@@ -4,7 +4,7 @@ import pytest
 import torch
 from tiny_backbones import NAMES, image, tiny
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.flow.path import interpolate
 from r2flow.generators import build_generator
 from tests.conftest import tiny_options

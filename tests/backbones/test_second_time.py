@@ -7,7 +7,7 @@ import torch
 from tiny_backbones import COLUMNS, ROWS, TWO_TIMES, Plain, image, rays, tiny, untrained
 
 from r2flow.backbones import Backbone
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 
 
 def grown(name: str) -> tuple[torch.nn.Module, torch.nn.Module]:

@@ -5,7 +5,7 @@ import torch
 
 from r2flow.backbones import build_backbone
 from r2flow.backbones.convolutions import Resample
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from tests.reference import load_case
 
 

@@ -11,8 +11,8 @@ from r2flow.callbacks.periodic import Periodic
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
+from r2flow.base.noise import standard_normal
 from r2flow.lidar.encoding import Encoding, ModelSpace
-from r2flow.noise import standard_normal
 from r2flow.reports import pictures
 from r2flow.reports.training import read_curves
 from tests.conftest import SENSOR, quiet_trainer

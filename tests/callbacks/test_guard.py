@@ -11,9 +11,9 @@ from r2flow.callbacks.guard import Guard
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
-from r2flow import noise
+from r2flow.base import noise
+from r2flow.base.errors import InputError
 from r2flow.data.loader import Permutations, RunSampler
-from r2flow.errors import InputError
 from r2flow.model.paths import checkpoints_of
 from tests.conftest import quiet_trainer, refused
 

@@ -8,14 +8,14 @@ import pytest
 from matplotlib.image import imread
 from r2flow.callbacks.loggers import LOGGERS, log_config, log_picture
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 
 PIXELS = np.arange(8 * 16 * 3, dtype=np.uint8).reshape(8, 16, 3)
 
 
 @pytest.mark.parametrize("name", ["wandb", "mlflow"])
 def test_a_missing_package_names_its_extra(name, tmp_path, monkeypatch):
-    monkeypatch.setattr("r2flow.errors.find_spec", lambda package: None)
+    monkeypatch.setattr("r2flow.base.errors.find_spec", lambda package: None)
     with pytest.raises(
         InputError, match=rf"loggers=\[{name}\] needs .* install 'r2flow\[{name}\]'"
     ):

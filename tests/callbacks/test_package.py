@@ -5,7 +5,7 @@ import lightning as L
 import pytest
 from r2flow.callbacks import CALLBACKS, Stopping, build_callbacks
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.runs.composing import compose
 from tests.conftest import ROOT
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow import noise
+from r2flow.base import noise
+from r2flow.base.errors import InputError
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.opening import describe
 from r2flow.data.prepared import PreparedScans
 from r2flow.data.resolving import reflectance_levels
 from r2flow.data.sources import InMemory, ScanFiles
-from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS

@@ -4,10 +4,10 @@ from unittest.mock import Mock
 
 import pytest
 
+from r2flow.base.errors import InputError
 from r2flow.data.layouts import Layout
 from r2flow.data.opening import SOURCES, find_drives
 from r2flow.data.sources import made_here
-from r2flow.errors import InputError
 from r2flow.store import Store
 from tests.conftest import write_scan
 

@@ -3,9 +3,9 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from r2flow.base.errors import InputError
 from r2flow.data.loader import MixedOrder, Mixture, Permutations, RunSampler
 from r2flow.data.sources import InMemory
-from r2flow.errors import InputError
 
 
 def numbers(*values: float) -> InMemory:

@@ -11,6 +11,8 @@ import pytest
 import torch
 
 import r2flow
+from r2flow.base.errors import InputError
+from r2flow.base.noise import standard_normal
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.layouts import Drive, Layout, SourceKind
 from r2flow.data.loader import ItemFormat
@@ -19,11 +21,9 @@ from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairDataset, PairStore, make_pairs
 from r2flow.data.reading import Reading
 from r2flow.data.sources import InMemory, made_here
-from r2flow.errors import InputError
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
-from r2flow.noise import standard_normal
 from r2flow.simulator import simulate
 from r2flow.simulator.folder import SimulatedFolder
 from r2flow.store import Store

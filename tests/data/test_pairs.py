@@ -12,16 +12,16 @@ from pathlib import Path
 import pytest
 import torch
 
+from r2flow.base.errors import InputError
+from r2flow.base.noise import standard_normal
+from r2flow.base.signals import LATER, Stopped
 from r2flow.cli.train import pairs
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairDataset, PairStore, default_folder, make_pairs
-from r2flow.errors import InputError
 from r2flow.model.lineage import find_parent
-from r2flow.models import find_model
-from r2flow.noise import standard_normal
+from r2flow.model.shipped import find_model
 from r2flow.samplers import build_sampler
-from r2flow.signals import LATER, Stopped
 from r2flow.store import Store
 from tests.conftest import files
 from tests.fields import Field

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from r2flow.base.errors import InputError
 from r2flow.data.opening import find_drives, open_scans
 from r2flow.data.reading import Reading, read_labelled_scan
-from r2flow.errors import InputError
 from r2flow.lidar.labels import labels_beside
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.scan_files.pickled import MOST_STEPS, read_table

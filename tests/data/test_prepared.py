@@ -14,6 +14,7 @@ import pytest
 import yaml
 from safetensors.numpy import load_file
 
+from r2flow.base.errors import InputError
 from r2flow.data.layouts import Drive
 from r2flow.data.opening import SOURCES, Described, find_drives
 from r2flow.data.options import SourceOptions
@@ -21,7 +22,6 @@ from r2flow.data.prepared import PreparedStore, plan_files, prepare, refuse_othe
 from r2flow.data.quantise import find_levels, range_codes, reflectance_codes
 from r2flow.data.reading import Reading, read_image
 from r2flow.data.sources import ScanFiles
-from r2flow.errors import InputError
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.store import MANIFEST, read_manifest
@@ -385,7 +385,9 @@ def test_a_manifest_that_is_damaged_or_missing_is_named(clouds: Path, tmp_path: 
 
 def test_a_data_set_is_prepared(r2flow, kitti_360, tmp_path, monkeypatch):
     # no pause
-    monkeypatch.setattr("r2flow.progress.Bar.__init__.__defaults__", ("scans", None, False, 0, 0.0))
+    monkeypatch.setattr(
+        "r2flow.base.progress.Bar.__init__.__defaults__", ("scans", None, False, 0, 0.0)
+    )
     out = tmp_path / "out"
     typed = (
         "prepare",

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from r2flow.base.errors import InputError
 from r2flow.data.reading import Reading, read_image
-from r2flow.errors import InputError
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensors import SENSORS
 from tests.conftest import memory_below

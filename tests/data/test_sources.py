@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from r2flow import simulator
+from r2flow.base.errors import InputError
 from r2flow.data.reading import Reading, read_image
 from r2flow.data.sources import InMemory, ScanFiles, SimulatedScans, holdout_block
-from r2flow.errors import InputError
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
 from tests.conftest import memory_below, numbers, write_scan

@@ -13,8 +13,9 @@ import pytest
 from hydra.core.config_store import ConfigStore
 from r2flow.callbacks import CALLBACKS
 
-from r2flow import cli, plugins
+from r2flow import cli
 from r2flow.backbones import BACKBONES
+from r2flow.base import plugins
 from r2flow.flow.losses import LOSSES
 from r2flow.generators import GENERATORS
 from r2flow.runs.composing import REGISTRIES

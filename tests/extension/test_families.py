@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.noise import Draws
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.export import tableau
 from r2flow.model.paths import checkpoints_of
 from r2flow.model.sampling import sample
-from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from tests.extension.conftest import (
     BACKBONE,

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from benchmarks.solvers import Mixed
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.noise import Draws
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import (
     PROBLEMS,
@@ -21,7 +22,6 @@ from r2flow.flow.problems import (
     Straight,
 )
 from r2flow.flow.solvers import LEAST_TOLERANCE, SOLVERS, solve
-from r2flow.noise import Draws
 
 METHODS = [*SOLVERS, "torchdiffeq:dopri5", "torchdiffeq:rk4"]
 X_0 = torch.randn(4, 16, generator=torch.Generator().manual_seed(3))

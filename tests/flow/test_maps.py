@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.flow.maps import OBJECTIVES, JumpTimes, consistency
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import Gaussian, Straight

@@ -16,10 +16,10 @@ from benchmarks.completion import (
     ring,
     velocity_of,
 )
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.noise import Draws
 from r2flow.flow.solvers import named_grid
 from r2flow.generators import build_generator
-from r2flow.noise import Draws
 from r2flow.samplers import MMPS, Repaint, build_sampler
 from r2flow.samplers.posterior import _GROWN, _solved
 from tests.fields import CONFIG, Field

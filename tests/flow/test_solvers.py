@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.flow.solvers import SOLVERS, EmbeddedMethod, FixedStep, named_grid, solve
 from r2flow.samplers import build_sampler

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from benchmarks.solvers import Mixed
+from r2flow.base.noise import standard_normal
 from r2flow.flow.path import expand_time
 from r2flow.flow.problems import (
     PROBLEMS,
@@ -21,7 +22,6 @@ from r2flow.flow.problems import (
     TwoModes,
 )
 from r2flow.flow.solvers import solve
-from r2flow.noise import standard_normal
 
 
 def noise(scenes, elements=256, seed=0):

@@ -11,11 +11,11 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.noise import Draws
 from r2flow.flow.solvers import named_grid
 from r2flow.generators import USUAL, build_generator
 from r2flow.lidar.region import Region
-from r2flow.noise import Draws
 from r2flow.samplers import SDE, build_sampler
 from r2flow.samplers.stochastic import back, sde, sde_step
 from tests.fields import CONFIG, Field

@@ -4,7 +4,7 @@ from decimal import Decimal, getcontext
 import pytest
 import torch
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.flow import times
 from r2flow.flow.times import TIMES, Discrete, Late, LogitNormal, Uniform, UShaped, build_density
 

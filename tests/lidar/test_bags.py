@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.bags import cloud_points, read_bag
 from r2flow.lidar.scan_files import read_points
 from tests.lidar.conftest import assert_points

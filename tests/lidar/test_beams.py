@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from r2flow.base.errors import InputError
 from r2flow.data.reading import Reading, scaled_reflectance
 from r2flow.data.sources import warn_of_frame, warn_of_other_sensor
-from r2flow.errors import InputError
 from r2flow.lidar.beams import FIRINGS, RING_AFTER_RING, RINGS, UNORDERED, find_beams
 from r2flow.lidar.estimation import (
     estimate_sensor,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.scan_files import ELSEWHERE, NoPointsError, read_points, write_points
 from tests.conftest import refused
 from tests.lidar.conftest import assert_points
@@ -270,7 +270,7 @@ def test_las(tmp_path: Path, version: str, form: int):
 def test_an_extra_that_is_missing_is_one_line_with_the_command(
     tmp_path: Path, monkeypatch, name: str
 ):
-    monkeypatch.setattr("r2flow.errors.find_spec", lambda package: None)
+    monkeypatch.setattr("r2flow.base.errors.find_spec", lambda package: None)
     (tmp_path / name).write_bytes(b"something")
     with pytest.raises(InputError, match=r"python -m pip install 'r2flow\[formats\]'"):
         read_points(tmp_path / name)

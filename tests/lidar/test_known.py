@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.generators.surroundings import nearest_returns
 from r2flow.lidar.interpolation import interpolated
 from r2flow.lidar.known import Ray, parse_mask, ray_states

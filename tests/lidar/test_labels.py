@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from r2flow.base.errors import InputError
 from r2flow.data.reading import Reading, read_labelled_scan
-from r2flow.errors import InputError
 from r2flow.lidar.labels import LABELS, labels_beside, read_labels
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS

@@ -6,9 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from r2flow.base.errors import InputError
 from r2flow.data.partial import open_partial
 from r2flow.data.reading import Reading, read_image
-from r2flow.errors import InputError
 from r2flow.lidar.beams import find_beams
 from r2flow.lidar.estimation import estimate_sensor, steps_of_a_turn
 from r2flow.lidar.projection import image_to_points, project, project_indices

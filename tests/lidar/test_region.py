@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.region import Region, region
 from r2flow.lidar.sensors import SENSORS
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.scan_files import read_points
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import r2flow
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.scan_files import read_points, read_range_image
 from tests.lidar.conftest import assert_points
 

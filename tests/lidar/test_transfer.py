@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 
 from r2flow.lidar.known import Ray
-from r2flow.lidar.projection import project
-from r2flow.lidar.scan_files import Points
-from r2flow.lidar.sensors import SENSORS, Sensor
-from r2flow.lidar.transfer import (
+from r2flow.lidar.other_sensors import (
     image_of_same,
     image_through,
     points_of_same,
@@ -19,6 +16,9 @@ from r2flow.lidar.transfer import (
     rows_of,
     sensor_of,
 )
+from r2flow.lidar.projection import project
+from r2flow.lidar.scan_files import Points
+from r2flow.lidar.sensors import SENSORS, Sensor
 
 TARGET = SENSORS["hdl64e"].resized(32, 256)
 VLP16 = SENSORS["vlp16"]

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from r2flow.base.errors import InputError
 from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading
-from r2flow.errors import InputError
 from r2flow.evaluation.copies import _copies_result, find_nearest
 from r2flow.evaluation.measuring import Work
 from tests.conftest import SENSOR, folder, images

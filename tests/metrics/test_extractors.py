@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics.extractors import EXTRACTORS, pointnet
 from r2flow.metrics.extractors.pointnet import PointNet

@@ -8,7 +8,7 @@ import tarfile
 import pytest
 import torch
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import SOURCES, _read_published, add, kept, weights_hash
 from r2flow.metrics.extractors.pointnet import PointNet

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torchmetrics import MetricCollection
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.metrics import METRICS
 from r2flow.metrics.base import SIDES, StoredMetric
 from r2flow.metrics.scans import Scans

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.reports.compare import _group_rows, cell, compare_page, configuration, group_runs
 from r2flow.reports.pages import write_page

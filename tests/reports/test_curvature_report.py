@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from r2flow.noise import Draws
+from r2flow.base.noise import Draws
 from r2flow.reports.curvature import _curvature_rows, curvature_page, measure_paths, summary
 from tests.conftest import SENSOR
 from tests.test_sampling import flow

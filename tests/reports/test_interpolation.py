@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 import torch
 
+from r2flow.base.errors import InputError
 from r2flow.data.reading import Reading
-from r2flow.errors import InputError
-from r2flow.inversion import interpolate_scans, real_scans
 from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
+from r2flow.model.inversion import interpolate_scans, real_scans
 from r2flow.reports.interpolation import interpolation
 from r2flow.samplers import build_sampler
 from r2flow.store import Store

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from r2flow.base.noise import Draws
 from r2flow.flow.problems import PROBLEMS
 from r2flow.flow.solvers import solve
 from r2flow.generators import build_generator
-from r2flow.noise import Draws
 from r2flow.reports.savings import savings, savings_text
 from r2flow.reports.solvers import (
     Subject,
@@ -157,7 +157,7 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch, caplog
 
     monkeypatch.setattr("r2flow.reports.solvers.checkpoint_subject", quick)
     monkeypatch.setattr("r2flow.reports.savings.savings", lambda *_: [])
-    monkeypatch.setattr("r2flow.plugins._loaded", {"of/mine.py": "of/mine.py"})
+    monkeypatch.setattr("r2flow.base.plugins._loaded", {"of/mine.py": "of/mine.py"})
     out = tmp_path / "reports"
     options = [
         "--num",

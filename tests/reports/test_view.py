@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from r2flow import load
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.labels import CLASSES
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points

@@ -5,7 +5,7 @@ whatever order.
 import numpy as np
 import pytest
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.projection import project
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS

@@ -10,9 +10,9 @@ import sys
 import numpy as np
 import pytest
 
+from r2flow.base.noise import generator
 from r2flow.lidar.labels import LABELS
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
-from r2flow.noise import generator
 from r2flow.simulator import draw_scene, simulate
 from r2flow.simulator.scene import BODY, FACADE
 from r2flow.simulator.shapes import Boxes, Cylinders, Frusta

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import nn
 
+from r2flow.base.errors import InputError
+from r2flow.base.noise import standard_normal
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.errors import InputError
 from r2flow.flow.losses import LOSSES
 from r2flow.flow.solvers import solve
 from r2flow.generators import USUAL, build_generator
-from r2flow.noise import standard_normal
 from r2flow.samplers import build_sampler
 from r2flow.stages import STAGES
 from r2flow.stages.base import learning_rate_factor

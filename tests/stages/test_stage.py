@@ -8,7 +8,7 @@ from lightning.pytorch.plugins import MixedPrecision
 from torch import nn
 from torch.utils.data import DataLoader
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.generators import Generated, Generator
 from r2flow.samplers import FixedSteps
 from r2flow.stages import Stage

@@ -8,16 +8,16 @@ import pytest
 import torch
 from scipy.integrate import quad
 
-from r2flow import noise
+from r2flow.base import noise
+from r2flow.base.errors import InputError
+from r2flow.base.noise import Draws
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.errors import InputError
 from r2flow.generators import TransferFlow, build_generator, condition_of, surroundings
 from r2flow.generators.answers import TOGETHER, Answers, smoothed
 from r2flow.generators.surroundings import Surroundings
 from r2flow.lidar.known import Ray, parse_mask, ray_states
 from r2flow.lidar.sensors import build_sensor
 from r2flow.model.completion import completing
-from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from r2flow.samplers.maps import Transport
 from r2flow.simulator import simulate

@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 import torch
 
+from r2flow.base.noise import Draws
 from r2flow.generators import build_generator
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.paths import checkpoints_of
 from r2flow.model.tensor_files import read_checkpoint
-from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from tests.conftest import refused
 from tests.systems.test_lidm import SMALL_AUTOENCODER, SMALL_UNET

@@ -13,7 +13,7 @@ import torch
 from r2flow.callbacks.ema import HalfLifeEMA, half_life_decay
 from torch import nn
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import unproject

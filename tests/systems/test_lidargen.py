@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import project_indices

@@ -15,16 +15,16 @@ import torch.nn.functional as F
 import yaml
 from torch import Tensor
 
+from r2flow.base.errors import InputError
+from r2flow.base.noise import Draws
+from r2flow.base.registry import options_of
 from r2flow.data.opening import reading_for
-from r2flow.errors import InputError
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import project, unproject
 from r2flow.lidar.sensors import build_sensor
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.lineage import Parent
-from r2flow.noise import Draws
-from r2flow.registry import options_of
 from r2flow.runs.composing import CONF
 from r2flow.samplers import build_sampler
 from r2flow.systems.diffusion.process import PREDICTIONS, noised, walk

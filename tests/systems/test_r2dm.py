@@ -11,14 +11,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.noise import Draws
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import unproject
 from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.completion import completing
-from r2flow.noise import Draws
 from r2flow.samplers import build_sampler
 from r2flow.systems.diffusion.generator import Diffusion
 from r2flow.systems.diffusion.process import (

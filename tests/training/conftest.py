@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from r2flow.base.errors import InputError
+from r2flow.base.signals import LATER
 from r2flow.cli.verbs import run as run_verb
-from r2flow.errors import InputError
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
-from r2flow.signals import LATER
 from r2flow.simulator import simulate
 from r2flow.training import build, compose, fit
 from tests.conftest import ROOT, Done, captured, draw_quickly

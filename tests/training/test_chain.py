@@ -9,7 +9,8 @@ import pytest
 import torch
 import yaml
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.signals import LATER
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.paths import checkpoints_of
 from r2flow.model.saving import weights_hash
@@ -18,7 +19,6 @@ from r2flow.reports.compare import report_chain
 from r2flow.runs.chain import links_of
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import has_ended
-from r2flow.signals import LATER
 from r2flow.training import Result, Run, build
 from tests.conftest import CONFIG, write_checkpoint
 from tests.training.conftest import (
@@ -43,7 +43,7 @@ def test_a_preview_is_drawn_once_and_before_the_chain(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     model = write_checkpoint(tmp_path / "street.ckpt", CONFIG)
-    monkeypatch.setattr("r2flow.models.find_model", {"street": model}.__getitem__)
+    monkeypatch.setattr("r2flow.model.shipped.find_model", {"street": model}.__getitem__)
     picture = tmp_path / "runs" / "demo" / "preview" / "samples.png"
     drawn: list[int] = []
     monkeypatch.setattr(

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 
+from r2flow.base.files import write_file
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.files import write_file
 from r2flow.generators import build_generator
 from r2flow.lidar.sensors import SENSORS, build_sensor, write_sensor
 from r2flow.runs.folder import CONFIG, RESUMED, open_run, read_config

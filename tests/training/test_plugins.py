@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from r2flow import plugins
 from r2flow.backbones import BACKBONES
-from r2flow.errors import InputError
+from r2flow.base import plugins
+from r2flow.base.errors import InputError
+from r2flow.base.plugins import load_plugins, made_with, take_plugins
+from r2flow.base.registry import Registry
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.model.saving import save_checkpoint
-from r2flow.plugins import load_plugins, made_with, take_plugins
-from r2flow.registry import Registry
 from r2flow.reports.compare import read_runs
 from r2flow.runs.composing import REGISTRIES, choices, compose
 from r2flow.runs.folder import open_run

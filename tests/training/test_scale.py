@@ -20,10 +20,10 @@ import torch
 from lightning.pytorch.utilities import rank_zero_only
 from r2flow.callbacks.stopping import slurm_job
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.signals import LATER
 from r2flow.model.paths import checkpoints_of
 from r2flow.model.tensor_files import read_checkpoint
-from r2flow.signals import LATER
 from r2flow.training import build, compose
 from tests.training.conftest import TINY, Run, hold_at, start, tiny, wait_for
 from tests.training.test_train import assert_bit_equal, weights

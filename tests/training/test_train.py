@@ -18,6 +18,7 @@ from hydra.core.global_hydra import GlobalHydra
 from r2flow.callbacks import Progress
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 
+from r2flow.base.signals import LATER
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import Sensor, write_sensor
 from r2flow.model.checkpoint import load_checkpoint
@@ -27,7 +28,6 @@ from r2flow.reports.outputs import what_next
 from r2flow.reports.training import read_curves
 from r2flow.runs.folder import read_config
 from r2flow.runs.launch import job_folder
-from r2flow.signals import LATER
 from tests.killing import wait_until
 from tests.training.conftest import TINY, Run, hold_at, in_process, start, stop_held, tiny, wait_for
 

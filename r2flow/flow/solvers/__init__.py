@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from r2flow.base.registry import Registry
 from r2flow.flow.solvers.adaptive import LEAST_TOLERANCE
 from r2flow.flow.solvers.embedded import EmbeddedMethod, dopri5
 from r2flow.flow.solvers.exponential import ExponentialMethod
@@ -32,7 +33,6 @@ from r2flow.flow.solvers.solution import (
     selected,
     wide,
 )
-from r2flow.registry import Registry
 
 __all__ = [
     "LEAST_TOLERANCE", "SOLVERS", "TORCHDIFFEQ", "EmbeddedMethod", "FixedStep", "Solution",

@@ -16,7 +16,7 @@ import torch
 from numpy import ndarray
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.flow.solvers.adaptive import attainable
 from r2flow.flow.solvers.batched import norms, powered, unpowered
 from r2flow.flow.solvers.solution import Evaluations, Solution, Spent

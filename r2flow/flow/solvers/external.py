@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.base.registry import Registry
 from r2flow.flow.solvers.adaptive import attainable
 from r2flow.flow.solvers.solution import Evaluations, Solution, Spent, finite
-from r2flow.registry import Registry
 
 log = logging.getLogger(__name__)
 

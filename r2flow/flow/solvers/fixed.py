@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.flow.solvers.solution import Evaluations, Solution, Velocity, finite, stepped
 
 

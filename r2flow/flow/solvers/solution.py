@@ -10,7 +10,7 @@ import torch
 from numpy import ndarray
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.flow.path import expand_time
 
 Velocity = Callable[[Tensor, Tensor], Tensor]

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 
-from r2flow.errors import IN_MEMORY, InputError, naming, warn_odd
-from r2flow.files import atomic_write, reading
+from r2flow.base.errors import IN_MEMORY, InputError, naming, warn_odd
+from r2flow.base.files import atomic_write, reading
 from r2flow.lidar.scan_files import clouds, pandaset, samples, tables
 from r2flow.lidar.scan_files.points import (
     FARTHEST,

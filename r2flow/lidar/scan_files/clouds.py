@@ -15,7 +15,7 @@ from typing import IO
 import numpy as np
 from numpy import ndarray
 
-from r2flow.errors import InputError, require
+from r2flow.base.errors import InputError, require
 
 PLY_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 PLY_CODES = {  # NumPy's codes of PLY's types

@@ -11,8 +11,8 @@ import numpy as np
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from r2flow.errors import InputError, check
-from r2flow.files import read_json
+from r2flow.base.errors import InputError, check
+from r2flow.base.files import read_json
 from r2flow.lidar.scan_files.clouds import Table
 from r2flow.lidar.scan_files.pickled import column, read_table
 from r2flow.lidar.sensors import SENSORS

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from r2flow.errors import InputError, check
+from r2flow.base.errors import InputError, check
 
 LARGEST_TABLE = 1 << 28  # bytes unpacked; a frame of PandaSet has 8 MB
 MOST_STEPS = 10_000  # of a pickle; a table has some hundreds

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 
-from r2flow.errors import InputError, warn_odd
+from r2flow.base.errors import InputError, warn_odd
 
 # No LiDAR measures 10 km or less than a millimetre. Nearly all floats read in the wrong byte order
 # or width are beyond these limits, because their exponent changes.

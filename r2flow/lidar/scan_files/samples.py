@@ -13,7 +13,7 @@ from zipfile import ZipFile
 import numpy as np
 from numpy import ndarray
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.scan_files.clouds import Table
 
 _CHANNELS = {"depth": (1,), "xyz": (3,), "reflectance": (0, 1)}

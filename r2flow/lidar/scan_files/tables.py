@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 
-from r2flow.errors import InputError, require
+from r2flow.base.errors import InputError, require
 from r2flow.lidar.scan_files.clouds import Table
 from r2flow.lidar.scan_files.points import is_renaming, role_of
 from r2flow.lidar.scan_files.widths import fits_width, fitting_widths

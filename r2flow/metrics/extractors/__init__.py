@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from r2flow.registry import Registry, lazy
+from r2flow.base.registry import Registry, lazy
 
 if TYPE_CHECKING:
     from r2flow.metrics.extractors.base import Extractor

@@ -15,14 +15,14 @@ import torch
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from r2flow.errors import InputError
-from r2flow.files import cache_folder, reading, reading_errors, write_file
-from r2flow.hashing import state_hash
+from r2flow.base.errors import InputError
+from r2flow.base.files import cache_folder, reading, reading_errors, write_file
+from r2flow.base.hashing import state_hash
+from r2flow.base.registry import Registry
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.scans import Scans
 from r2flow.model.parts import NOTES
 from r2flow.model.tensor_files import read_tensors, read_torch
-from r2flow.registry import Registry
 
 R2FLOW = "https://github.com/kazuto1011/r2flow/releases/download/weights"
 BONNETAL = "http://www.ipb.uni-bonn.de/html/projects/bonnetal/lidar/semantic/models"

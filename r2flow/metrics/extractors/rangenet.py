@@ -14,7 +14,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.metrics.extractors.base import Extractor, Tensors
 from r2flow.metrics.scans import Scans
 

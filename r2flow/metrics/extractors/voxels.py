@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.metrics.extractors.base import Extractor, Tensors
 from r2flow.metrics.extractors.sparse import (
     Sparse,

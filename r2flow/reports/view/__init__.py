@@ -23,8 +23,8 @@ import numpy as np
 from numpy import ndarray
 from torch import Tensor
 
-from r2flow.errors import InputError, printable
-from r2flow.files import write_file
+from r2flow.base.errors import InputError, printable
+from r2flow.base.files import write_file
 from r2flow.reports.pictures import class_colours, colours, view_of
 
 MOST = 256 * 64 * 1024  # maximum pixels of all images of a page: about 33 MB

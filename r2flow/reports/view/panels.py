@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from numpy import ndarray
 
+from r2flow.base.errors import InputError
+from r2flow.base.progress import Bar
 from r2flow.data.opening import SOURCES, describe, find_drives, open_scans
 from r2flow.data.options import FOLDER, SIMULATED
 from r2flow.data.reading import Reading, estimated_scale, read_labelled_scan
@@ -20,11 +22,9 @@ from r2flow.data.sources import (
     spread,
     warn_of_other_sensor,
 )
-from r2flow.errors import InputError
 from r2flow.lidar.labels import labels_beside
 from r2flow.lidar.scan_files import points_beside, read_range_image
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.progress import Bar
 from r2flow.reports.tables import short_names
 from r2flow.reports.view import Panel, write_viewer
 from r2flow.simulator import simulate

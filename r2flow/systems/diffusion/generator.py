@@ -6,10 +6,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from r2flow.base.registry import Options, Positive, Share
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.flow import NetworkFlow
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.registry import Options, Positive, Share
 from r2flow.samplers import MMPS, Repaint
 from r2flow.samplers.base import (
     Call,

@@ -6,10 +6,10 @@ A dict of cfg, weights, ema_weights, optimizer, lr_scheduler and global_step.
 from pathlib import Path
 from typing import Any
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Options
 from r2flow.model.published import BACKBONE, Format, Published, has_keys, rings_of
 from r2flow.model.published import published_config as flow_config
-from r2flow.registry import Options
 
 _RANGES = {"log_depth": "logscale", "inverse_depth": "inverse", "depth": "metric"}
 _PREDICTIONS = {"eps": "eps", "v": "v", "x_0": "x"}

@@ -11,8 +11,8 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
-from r2flow.registry import Bound, NonNegative, Positive, Registry
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Bound, NonNegative, Positive, Registry
 
 LogSNR = Callable[[Tensor], Tensor]
 Steps = Annotated[int, Bound("at least 2", lambda n: n >= 2)]

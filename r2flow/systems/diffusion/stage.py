@@ -5,7 +5,7 @@ from typing import Any
 import torch.nn.functional as F
 from torch import Tensor
 
-from r2flow.registry import Positive, Registry
+from r2flow.base.registry import Positive, Registry
 from r2flow.stages.base import Batch, SingleLoss
 from r2flow.systems.diffusion.generator import Diffusion
 from r2flow.systems.diffusion.process import noised

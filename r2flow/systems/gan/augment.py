@@ -13,9 +13,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones.layers import at_least_float32
-from r2flow.noise import generator
-from r2flow.processes import sum_over_processes
-from r2flow.registry import Natural, NonNegative, Portion
+from r2flow.base.noise import generator
+from r2flow.base.processes import sum_over_processes
+from r2flow.base.registry import Natural, NonNegative, Portion
 
 # Low-pass filter of the wavelet sym6 (Daubechies 1992), for up- and downsampling.
 _SYM6 = (

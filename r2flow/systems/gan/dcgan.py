@@ -8,8 +8,8 @@ from itertools import pairwise
 from torch import nn
 
 from r2flow.backbones.layers import halved
+from r2flow.base.registry import Count, Options, Positive
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.registry import Count, Options, Positive
 from r2flow.systems.gan.generator import Gan
 from r2flow.systems.gan.layers import (
     IMAGE,

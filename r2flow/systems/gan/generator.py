@@ -6,11 +6,11 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
+from r2flow.base.noise import Draws
+from r2flow.base.registry import Bound
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.base import Generator
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.noise import Draws
-from r2flow.registry import Bound
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler
 from r2flow.systems.gan.layers import LatentGenerator, Outputs
 

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones.layers import ExactBuffers, at_least_float32, uncast, wrapped
-from r2flow.processes import mean_over_processes
+from r2flow.base.processes import mean_over_processes
 
 DROPPED = -1.0  # value of a dropped ray in model space
 Outputs = dict[str, Tensor]  # of a network, by name

@@ -6,8 +6,8 @@ They have the entries cfg, step, angle, G, G_ema, D, ...
 from pathlib import Path
 from typing import Any
 
+from r2flow.base.registry import Options
 from r2flow.model.published import Format, Published, has_keys, sensor_of
-from r2flow.registry import Options
 from r2flow.systems.gan.layers import DROPPED
 
 GENERATORS = {"vanilla": "vanilla_gan", "dusty_v1": "dusty1", "dusty_v2": "dusty2"}

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from r2flow.registry import Count, Natural, NonNegative, Options, Portion, Registry, construct
+from r2flow.base.registry import Count, Natural, NonNegative, Options, Portion, Registry, construct
 from r2flow.stages.base import Batch, Stage
 from r2flow.systems.gan import dcgan, style_discriminator
 from r2flow.systems.gan.augment import AdaptiveAugment, BatchDraws

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.backbones.layers import at_least_float32, halved
-from r2flow.registry import Count
+from r2flow.base.registry import Count
 from r2flow.systems.gan.layers import BiasedLeakyReLU, BlurBoth, Equalised, Filter, Pad
 
 

@@ -13,10 +13,10 @@ from torch import Tensor, nn
 
 from r2flow.backbones.convolutions import Resample
 from r2flow.backbones.layers import ExactBuffers, at_least_float32, halved
+from r2flow.base.processes import mean_over_processes
+from r2flow.base.registry import Count, Options, Positive
 from r2flow.generators.base import Generator
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.processes import mean_over_processes
-from r2flow.registry import Count, Options, Positive
 from r2flow.systems.gan.generator import Gan
 from r2flow.systems.gan.layers import (
     IMAGE,

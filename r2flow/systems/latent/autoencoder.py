@@ -17,8 +17,8 @@ from torch import Tensor, nn
 from r2flow.backbones.base import integers
 from r2flow.backbones.convolutions import GroupNorm, projection
 from r2flow.backbones.layers import wrapped
-from r2flow.errors import InputError
-from r2flow.registry import Count, NonNegative
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Count, NonNegative
 from r2flow.systems.latent.quantiser import Quantiser
 
 Size = tuple[int, int]

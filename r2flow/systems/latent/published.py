@@ -14,12 +14,12 @@ import torch
 import yaml
 from torch import Tensor
 
-from r2flow.errors import InputError
-from r2flow.files import reading_errors
+from r2flow.base.errors import InputError
+from r2flow.base.files import reading_errors
+from r2flow.base.registry import Config, Options
 from r2flow.lidar.encoding import ShiftedLog
 from r2flow.lidar.sensors import build_sensor
 from r2flow.model.published import Format, Published
-from r2flow.registry import Config, Options
 from r2flow.systems.latent.autoencoder import UP
 
 log = logging.getLogger(__name__)

@@ -6,9 +6,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from r2flow.base.processes import mean_over_processes
+from r2flow.base.registry import Count, Natural, NonNegative, Options, construct
 from r2flow.lidar.encoding import Encoding
-from r2flow.processes import mean_over_processes
-from r2flow.registry import Count, Natural, NonNegative, Options, construct
 from r2flow.stages.base import Batch, SingleLoss, Stage
 from r2flow.systems.diffusion.process import noised
 from r2flow.systems.latent.generator import LatentDiffusion, VQAutoencoder

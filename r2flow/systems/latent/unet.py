@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from r2flow.backbones.base import integers
 from r2flow.backbones.convolutions import GroupNorm, projection
 from r2flow.backbones.layers import ExactLinear, at_least_float32, halved, zero_initialised
-from r2flow.registry import Count
+from r2flow.base.registry import Count
 from r2flow.systems.latent.autoencoder import CircularConv2d
 
 

@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from r2flow.backbones.layers import halved
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Count, Options, Positive
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.base import IMAGE, KNOWN, Generator
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.registry import Count, Options, Positive
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
 from r2flow.systems.score.refinenet import RefineNet
 

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones.layers import at_least_float32
-from r2flow.registry import Count
+from r2flow.base.registry import Count
 
 
 def _convolution(

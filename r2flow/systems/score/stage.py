@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from r2flow.registry import NonNegative
+from r2flow.base.registry import NonNegative
 from r2flow.stages.base import Batch, SingleLoss
 from r2flow.systems.score.generator import ScoreModel, score_loss
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from r2flow import noise
+from r2flow.base import noise
 from r2flow.generators import GENERATORS, RectifiedFlow
 from r2flow.stages import STAGES, Rectify
 

@@ -11,7 +11,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from r2flow.errors import InputError, naming
+from r2flow.base.errors import InputError, naming
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 
 
 def choose_device(name: str, option: str = "--device") -> str:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from r2flow.registry import Config, Options
+from r2flow.base.registry import Config, Options
 
 # May differ on resume, since they do not affect the result. data.pairs.parent identifies the flow
 # of data.pairs.of.

@@ -6,10 +6,10 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from r2flow.errors import check
-from r2flow.registry import Registry
+from r2flow.base.errors import check
+from r2flow.base.registry import Registry
 
-FOLDER = Path(__file__).parent
+FOLDER = Path(__file__).with_name("weights")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 
 PURPOSES = (
     "training",

@@ -15,20 +15,20 @@ import torch
 from numpy import ndarray
 from scipy.spatial import cKDTree
 
-from r2flow import noise
+from r2flow.base import noise
+from r2flow.base.errors import InputError
+from r2flow.base.files import atomic_write, save_array
+from r2flow.base.progress import Bar, track
 from r2flow.data.partial import PartialScan
-from r2flow.errors import InputError
-from r2flow.files import atomic_write, save_array
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.lidar.known import Mask, Ray, share_in_sectors
+from r2flow.lidar.other_sensors import Partial
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import WRITTEN, write_points
-from r2flow.lidar.transfer import Partial
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import Completed, complete
-from r2flow.models import DEFAULT, DENSIFY
-from r2flow.progress import Bar, track
+from r2flow.model.shipped import DEFAULT, DENSIFY
 from r2flow.reports.outputs import recipe_of
 from r2flow.reports.pictures import contact_sheet, save_figure
 from r2flow.reports.view import Panel, write_viewer

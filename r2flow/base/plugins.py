@@ -20,8 +20,8 @@ from pathlib import Path
 from traceback import walk_tb
 from typing import Any
 
-from r2flow.errors import InputError, check
-from r2flow.registry import Registry, UnknownName
+from r2flow.base.errors import InputError, check
+from r2flow.base.registry import Registry, UnknownName
 
 GROUP = "r2flow.plugins"
 

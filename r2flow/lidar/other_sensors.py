@@ -14,7 +14,7 @@ import numpy as np
 from numpy import ndarray
 from scipy import ndimage
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 from r2flow.lidar.estimation import estimate_sensor, steps_of_a_turn
 from r2flow.lidar.known import Ray
 from r2flow.lidar.projection import (

@@ -13,8 +13,8 @@ from pathlib import Path
 from types import FrameType, SimpleNamespace
 from typing import Any
 
-from r2flow.errors import InputError
-from r2flow.signals import blocking_signals, code_of, end_with_parent
+from r2flow.base.errors import InputError
+from r2flow.base.signals import blocking_signals, code_of, end_with_parent
 
 Work = Callable[[int], None]
 

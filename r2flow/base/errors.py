@@ -26,7 +26,7 @@ class InputError(ValueError):
 
 
 def check(holds: object, message: str) -> None:
-    """Raise an InputError unless a condition holds; `r2flow.files.reading` adds the file's name."""
+    """Raise an InputError unless a condition holds; `files.reading` adds the file's name."""
     if not holds:
         raise InputError(message)
 

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from r2flow.base.errors import InputError
 from r2flow.data.opening import open_scans, reading_for
 from r2flow.data.reading import AUTO
-from r2flow.errors import InputError
 from r2flow.generators import Sampler, as_flow
 from r2flow.generators.base import Progress
 from r2flow.model.checkpoint import Checkpoint

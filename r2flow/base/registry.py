@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, with_config
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
-from r2flow.errors import InputError
+from r2flow.base.errors import InputError
 
 T = TypeVar("T")
 

@@ -1,0 +1,1 @@
+"""The ground floor: what all parts stand on; it knows nothing of scans or flows."""
