@@ -49,8 +49,8 @@ def test_a_config_file_that_contains_itself_is_one_line(tmp_path: Path):
 @pytest.mark.parametrize(
     ("message", "peer", "kind", "words"),
     [
-        ("[../third_party/gloo/pair.cc:534] Connection closed by peer [127.0.0.1]:42619", -9, Stopped, "starts it"),
-        ("NCCL error: remote process exited or there was a network error", LATER, Stopped, "starts it"),
+        ("[../third_party/gloo/pair.cc:534] Connection closed by peer [127.0.0.1]:42619", -9, Stopped, "resumes"),
+        ("NCCL error: remote process exited or there was a network error", LATER, Stopped, "resumes"),
         ("Failed to recv, got 0 bytes. Connection was likely closed.", 2, InputError, "error"),
     ],
 )  # fmt: skip

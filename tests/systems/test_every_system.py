@@ -208,7 +208,7 @@ GARBLED = [
     (
         "r2dm",
         garble("model", architecture="refinenet"),
-        "no published architecture named 'refinenet'",
+        "no backbone named 'refinenet'",
     ),
     ("r2dm", garble("diffusion", noise_schedule="sigmoid"), "no log-SNR schedule named 'sigmoid'"),
     ("lidargen", None, "KeyError: 'network.sigmas'"),
