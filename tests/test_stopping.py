@@ -64,13 +64,13 @@ def test_told_to_stop_during_an_import(tmp_path: Path, command: str, argv: list[
 LOADER = """
 import os, time
 from torch.utils.data import DataLoader
-from r2flow.base.signals import end_with_parent
+from r2flow.base.signals import init_loader_worker
 
 def big(item):
     open(f"pid-{os.getpid()}", "w").close()
     return b"x" * 2**20  # more than a pipe takes: a worker waits for its reader
 
-loader = iter(DataLoader(range(100), batch_size=None, num_workers=2, collate_fn=big, worker_init_fn=end_with_parent))
+loader = iter(DataLoader(range(100), batch_size=None, num_workers=2, collate_fn=big, worker_init_fn=init_loader_worker))
 next(loader)
 time.sleep(100)
 """
@@ -96,7 +96,7 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path, script: str):
 
 
 def test_workers_of_a_failed_run_end_with_it(tmp_path: Path):
-    script = LOADER.replace("end_with_parent", "init_loader_worker").replace("time.sleep(100)", "")
+    script = LOADER.replace("time.sleep(100)", "")
     assert start(tmp_path, ["-c", script], [sys.executable]).communicate(timeout=25)[0] == ""
 
 
