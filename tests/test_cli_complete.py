@@ -21,7 +21,7 @@ from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS, write_sensor
 from r2flow.model import checkpoint
-from r2flow.reports import completed
+from r2flow.reports import answers
 from r2flow.simulator import simulate
 from tests.conftest import SENSOR, Done, prepare_folder, write_run
 from tests.test_completion import network
@@ -253,11 +253,11 @@ def test_answers_to_another_scan_of_the_same_name_are_none(complete, tmp_path, e
     full_scan(tmp_path / "b" / f"two{ending}", 0)
     (tmp_path / "b" / f"one{ending}").unlink()
     assert "1 scan written" in complete(tmp_path / "b", *asked)[1]
-    answer, both, last = completed.complete, tmp_path / "both", tmp_path / "last"
+    answer, both, last = answers.complete, tmp_path / "both", tmp_path / "last"
     # a command that begins and ends meanwhile
     other = [lambda: complete(tmp_path / "b", *asked, out=both)]
     monkeypatch.setattr(
-        completed, "complete", lambda *a, **how: (other and other.pop()(), answer(*a, **how))[1]
+        answers, "complete", lambda *a, **how: (other and other.pop()(), answer(*a, **how))[1]
     )
     assert [complete(tmp_path / drive, *asked, out=both)[0] for drive in "aab"] == [0, 0, 0]
     other = [lambda: complete(tmp_path / "b", *asked, out=last)]
