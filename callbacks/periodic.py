@@ -87,7 +87,8 @@ class SamplePictures(Periodic):
             self.sampler(generator)
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        self.check(pl_module.generator)
+        generator: Generator = pl_module.generator  # type: ignore[assignment]
+        self.check(generator)
 
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         step = trainer.global_step
