@@ -38,7 +38,7 @@ napoleon_use_ivar = True
 PAGES = Path(__file__).parent / "api"
 EXTRAS = ("r2flow.model.hub", "r2flow.model.onnx_graphs")  # which need further packages
 ROOMS = ("", "model", "generators", "samplers", "flow", "backbones", "systems", "lidar", "data", "simulator", "metrics",
-         "evaluation", "stages", "training", "config", "registry", "plugins", "store", "noise", "errors")  # fmt: skip
+         "evaluation", "stages", "training", "store", "base")  # fmt: skip
 
 
 def write_api() -> None:
