@@ -94,8 +94,9 @@ def test_the_parent_may_move_and_must_have_the_same_weights():
     ]
 
 
-def test_a_run_of_epochs_ends_at_the_step_that_its_checkpoint_notes(tmp_path: Path):
-    open_run(tmp_path, changed(trainer={"max_steps": -1, "max_epochs": 2}))
+@pytest.mark.parametrize("trainer", [{"max_steps": -1, "max_epochs": 2}, None])
+def test_a_run_of_epochs_ends_at_the_step_that_its_checkpoint_notes(tmp_path: Path, trainer):
+    open_run(tmp_path, changed(trainer=trainer))  # None: of a config written by hand
     for step, ended in ((5, False), (6, True)):
         checkpoint(tmp_path, step, total_steps=6)
         assert has_ended(tmp_path) == ended

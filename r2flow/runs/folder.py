@@ -82,9 +82,9 @@ def has_ended(run: str | Path, last: Path | None = None) -> bool:
     last = last or next(iter(checkpoints_of(run)), None)
     if config is None or last is None:
         return False
-    options = config["trainer"]
-    total = options["max_steps"]
-    if options["max_epochs"] != -1:
+    options = config.get("trainer") or {}
+    total = options.get("max_steps", 0)
+    if options.get("max_epochs") != -1:
         total = read_checkpoint(last)[NOTES]["total_steps"]
     return 0 < total <= step_of(last)
 
