@@ -4,7 +4,7 @@ from typing import Annotated
 import pytest
 
 from r2flow.base.errors import InputError
-from r2flow.base.registry import MISSING, Registry, check_options, options_of
+from r2flow.base.registry import MISSING, Registry, check_options, options_of, presets
 
 
 def test_a_name_that_is_taken_is_refused_except_in_a_notebook():
@@ -68,3 +68,13 @@ def test_options_are_those_by_keyword():
 
     assert options_of(Settings) == {"size": MISSING, "damping": 0.5}
     assert options_of(lambda *given, damping=1.0: None, given=2) == {"damping": 1.0}
+
+
+def test_of_several_bases_of_a_file_the_last_one_holds_as_in_hydra(tmp_path, monkeypatch):
+    folder = tmp_path / "several_bases"
+    folder.mkdir()
+    (folder / "first.yaml").write_text("{x: 1, y: 1, z: 1}")
+    (folder / "last.yaml").write_text("{x: 2, y: 2}")
+    (folder / "both.yaml").write_text("{defaults: [first, last, _self_], x: 3}")
+    monkeypatch.setattr("r2flow.base.registry.files", lambda package: tmp_path)
+    assert presets("several_bases")["both"] == {"x": 3, "y": 2, "z": 1}

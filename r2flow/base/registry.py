@@ -175,7 +175,7 @@ def presets(group: str) -> dict[str, Config]:
 
     def merged(name: str) -> Config:
         options = dict(read[name])
-        for base in options.pop("defaults", ()):
+        for base in reversed(options.pop("defaults", [])):
             if base in read:
                 options = merged(base) | options
         return options
