@@ -219,7 +219,7 @@ def _chain(settings: Config, given: Sequence[str], folders: Sequence[str]) -> in
         if settings["preview"]:
             picture = folder / "preview" / "samples.png"
             print(
-                f"Flows trained this briefly draw blurred scans; {picture} shows those of "
+                f"Flows trained this briefly draw noisy scans; {picture} shows those of "
                 f"{settings['preview']}, after long training."
             )
     return 0
