@@ -170,7 +170,7 @@ def test_a_flow_without_a_condition_says_what_completes_with_it():
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"images": torch.zeros(1, 2, 8, 32)}, r"must be \(B, 2 or 1, 8, 64\)"),
+        ({"images": torch.zeros(1, 2, 8, 32)}, r"must be \(B, 1 to 2, 8, 64\)"),
         ({"images": torch.full((1, 2, 8, 64), math.nan)}, "nan m"),
         ({"images": torch.full((1, 2, 8, 64), 0.5)}, "a range of 0.5 m"),
         ({"images": torch.full((1, 2, 8, 64), 3.0)}, "reflectance goes up to 3, not 1; divide"),

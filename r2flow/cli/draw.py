@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from typer import Argument, Option
 
 from r2flow.base.devices import choose_device
-from r2flow.base.errors import InputError, check_folder
+from r2flow.base.errors import InputError, check, check_folder
 from r2flow.cli.app import app
 from r2flow.cli.options import (
     SETS,
@@ -77,6 +77,9 @@ def sample(
         str | None, Option(help="Formats, of ply,bin,npy. Default: all possible.")
     ] = None,
     pictures: Annotated[int, Option(min=0, help="Number of scans to draw as pictures.")] = 8,
+    labels: Annotated[
+        str | None, Option(help="A labelled model that labels the points: NAME.label.")
+    ] = None,
 ) -> None:
     """Sample scans from a trained model (default: `street`): point clouds, range images and
     pictures.
@@ -97,6 +100,12 @@ def sample(
     sampler = loaded.generator.choose(**how.given)
     chosen = [*dict.fromkeys(format.split(","))] if format else None
     region = _region(loaded, sector, rows) if sector or rows else None
+    labeller = None
+    if labels:
+        check(region is None, "--labels needs whole scans: leave --sector and --rows out.")
+        labeller = load_checkpoint(labels, device=choose_device(draw.device))
+        check(labeller.encoding.labels, f"{labels} has no labels: give --labels labels.")
+        labeller = labeller.through(loaded.sensor)
     formats = write_samples(
         loaded,
         out,
@@ -108,6 +117,7 @@ def sample(
         draw.batch_size,
         region,
         precision=precision,
+        labels=labeller,
     )
     print(f"{several(draw.num)} ({', '.join(formats)}) in {out}")
     if pictures:
@@ -212,6 +222,12 @@ class PartialOptions:
             "--fill-gaps", help="Treat rays without a return as unmeasured, as in a thinned scan."
         ),
     ] = False
+    hide: Annotated[
+        list[str] | None,
+        Option(
+            help="Channels to draw anew: label, reflectance, or range, which leaves labels alone."
+        ),
+    ] = None
     reflectance_scale: ScaleChoice = None
     columns: ColumnsOption = None
     scans: Annotated[
@@ -227,7 +243,7 @@ class PartialOptions:
         """
         from r2flow.lidar.sensors import named_sensor
         from r2flow.model.checkpoint import load_checkpoint
-        from r2flow.model.shipped import DENSIFY
+        from r2flow.model.shipped import MODELS
 
         loaded = load_checkpoint(model, choose_device(device))
         if self.to or self.size:
@@ -235,7 +251,7 @@ class PartialOptions:
         return loaded.open_partial(
             what,
             self.source,
-            keep_beams=model == DENSIFY and not (self.to or self.size),
+            keep_beams=model in MODELS and not (self.to or self.size),
             scale=self.reflectance_scale,
             most=self.scans,
             columns=self.columns,
@@ -291,7 +307,8 @@ def complete(
 
     check_folder(out)
     mask = parse_mask(given.mask) if given.mask else None
-    job = Job(num, seed, mask, given.fill_gaps, batch_size, pictures)
+    hidden = frozenset(given.hide or ())
+    job = Job(num, seed, mask, given.fill_gaps, hidden, batch_size, pictures)
     jumps = how.given.get("name", "jump") in ("jump", "transport")
     name = checkpoint or (DENSIFY if jumps else DEFAULT)
     loaded, scans, remarks = given.open(name, device, what)
@@ -301,6 +318,11 @@ def complete(
             name = DEFAULT
             loaded, scans, remarks = given.open(name, device, what)
         _print_model(name)
+    for channel in given.hide or ():
+        check(
+            channel in loaded.encoding.slices,
+            f"the model has the channels {', '.join(loaded.encoding.slices)}, not {channel}.",
+        )
     job = replace(job, precision=precision or usual_precision(loaded.generator))
     sampler = completing(loaded.generator, several=num > 1, **how.given)
     for remark in remarks:

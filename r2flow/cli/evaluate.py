@@ -46,8 +46,22 @@ def evaluate(
     named = list(dict.fromkeys(generated or []))
     if not (named or options.reference or options.baselines):
         raise InputError("nothing to compare with: give GENERATED or --reference.")
+    if options.metrics == "miou":
+        return _evaluate_labels(real, named)
     with process_group(choose_device(options.device)) as device:
         _evaluate(real, named, options, how, device)
+
+
+def _evaluate_labels(real: str, named: Sequence[str]) -> None:
+    from r2flow.reports.labels import label_rows
+    from r2flow.reports.tables import print_table
+
+    for name in named:
+        rows, calibration = label_rows(real, name)
+        print_table(rows, {"class": "class", "iou": "IoU", "points": "points"}, f"labels of {name}")
+        if calibration:
+            columns = {"said": "said", "right": "right", "points": "points"}
+            print_table(calibration, columns, "probability that a label is right")
 
 
 def _evaluate(

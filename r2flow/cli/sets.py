@@ -42,7 +42,8 @@ class EvaluateOptions:
         str | None,
         Option(
             help="Metrics, separated by commas, or all available here: all. Default: panel, KID "
-            "and Frechet distance of hand-made features, JSD, MMD."
+            "and Frechet distance of hand-made features, JSD, MMD. miou alone: labels beside scans "
+            "of the same names."
         ),
     ] = None
     protocol: Annotated[

@@ -65,7 +65,7 @@ def show(
         raise InputError(f"{out} is the folder of the scans; give another --out.")
     names: set[str] = set()
     readings = {spec: how.reading([spec], estimate_scale=True) for spec in scans}
-    for _, panel in scan_panels(share_scale(readings, most), most, labelled=False):
+    for _, panel in scan_panels(share_scale(readings, most), most):
         stem = Path(panel.caption).stem
         versions = (stem if number == 1 else f"{stem}_{number}" for number in count(1))
         name = next(version for version in versions if version not in names)
@@ -75,7 +75,9 @@ def show(
             save_array(path, panel.images[0])
         else:
             view = STREET if fixed else None
-            save_figure(scan_figure(panel.images[0], panel.rays, panel.caption, view), path)
+            labels = None if panel.labels is None else panel.labels[0]
+            figure = scan_figure(panel.images[0], panel.rays, panel.caption, view, labels)
+            save_figure(figure, path)
         print(path)
 
 

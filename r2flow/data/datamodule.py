@@ -257,7 +257,12 @@ class ScanDataModule(L.LightningDataModule):
     def _open(
         self, scans: Described, first_scene: int = 0, sensor: Sensor | None = None
     ) -> ScanSource:
-        images = {"reflectance": self.format.encoding.reflectance, "within_limits": True}
+        encoding = self.format.encoding
+        images = {
+            "reflectance": encoding.reflectance,
+            "labels": encoding.labels,
+            "within_limits": True,
+        }
         own = (sensor or self.format.encoding.sensor).described()
         reading = Reading.of({**scans.options.chosen, **images, "sensor": own})
         return scans.open(reading, self.seed, first_scene)

@@ -71,12 +71,13 @@ class FlowDataset(Dataset[Item]):
         x_0 = torch.from_numpy(draw.standard_normal(self.format.noise_shape, dtype=np.float32))
         u = torch.tensor(draw.random(dtype=np.float32))
         encoding = self.encodings[self.source.locate(index)[0]]
-        image = self.source[index][: encoding.channels]
-        if image.shape == encoding.shape:
+        shape = (len(encoding.slices), *encoding.sensor.shape)
+        image = self.source[index][: shape[0]]
+        if image.shape == shape:
             far = max(FAR, encoding.sensor.max_range)
             wrong = wrong_with(torch.from_numpy(image), far)
         else:
-            wrong = f"an image of {encoding.shape}, found {image.shape}"
+            wrong = f"an image of {shape}, found {image.shape}"
         if wrong:
             raise InputError(f"{self.source.names[index]}: {wrong}.")
         if self.augment:

@@ -51,7 +51,9 @@ class Simulated(SourceKind):
         self, scans: "Described", reading: Reading, seed: int = 0, first_scene: int = 0
     ) -> ScanSource:
         scenes = range(first_scene, first_scene + scans.options.scenes)
-        return SimulatedScans(reading.sensor, seed, scenes, bool(reading.reflectance))
+        return SimulatedScans(
+            reading.sensor, seed, scenes, bool(reading.reflectance), reading.labels
+        )
 
 
 class Prepared(SourceKind):
@@ -63,6 +65,7 @@ class Prepared(SourceKind):
         options = scans.options
         store = read_prepared(options.folder)
         refuse_other_images(store, reading)
+        check(not reading.labels, f"{options.folder}: prepared scans have no labels.")
         layout = store.described["layout"]
         kind = SOURCES[layout if layout in SOURCES else FOLDER]
         if options.split is None and options.drives is None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from r2flow.base.errors import InputError, check, naming, warn_odd
 from r2flow.data.opening import Described, describe, open_scans
@@ -18,6 +19,8 @@ from r2flow.data.reading import DIVIDED, Reading, nothing_in_view, scaled_reflec
 from r2flow.data.sources import LOOKED_AT, spread, warn_of_frame
 from r2flow.lidar.encoding import FAR, wrong_with
 from r2flow.lidar.estimation import FULL_REFLECTANCE, SURE, full_reflectance, other_sensor
+from r2flow.lidar.known import Ray
+from r2flow.lidar.labels import common_classes, labels_beside, read_labels
 from r2flow.lidar.other_sensors import (
     Partial,
     image_through,
@@ -125,10 +128,10 @@ def _files(
     spec = described.label
     source = source or (stored.sensor if stored else None)
     whole = None
-    images = {
-        path for path in paths if path.suffix.lower() == ".npy" and read_numbers(path).ndim == 3
-    }
-    read_image: Callable[[Path], Partial] = partial(_read_image, source=source, target=target)
+    images = {path for path in paths if path.suffix.lower() == ".npy" and _is_image(path)}
+    read_image: Callable[[Path], Partial] = partial(
+        _read_image, source=source, target=target, labels=reading.labels
+    )
     by_points = read_image
     if points := [path for path in paths if path not in images]:
         scans = [
@@ -290,6 +293,10 @@ def _seen(
             seen = points_through(points, fired, target, strength)
     if not seen.image[0].any():
         raise nothing_in_view(path, points, target)
+    file = labels_beside(path) if reading.labels else None
+    if file:
+        classes = common_classes(read_labels(file, path, points))
+        seen = replace(seen, image=_with_classes(seen, points.xyz, classes))
     r = np.linalg.norm(points.xyz, axis=1)
     inside = (r >= target.min_range) & (r <= target.max_range)
     outside = int(np.count_nonzero(r) - inside.sum())
@@ -299,8 +306,40 @@ def _seen(
     return replace(seen, points=kept)
 
 
-def _read_image(path: Path, source: Sensor | None, target: Sensor) -> Partial:
+def _with_classes(seen: Partial, xyz: np.ndarray, classes: np.ndarray) -> np.ndarray:
+    """The image of a scan with the class of the point of each pixel, (3, H, W)."""
+    image = np.zeros((3, *seen.state.shape), np.float32)
+    image[: len(seen.image)] = seen.image
+    returned = seen.state == Ray.RETURN
+    assert seen.xyz is not None
+    image[2, returned] = classes[cKDTree(xyz).query(seen.xyz[:, returned].T)[1]]
+    return image
+
+
+def _is_image(path: Path) -> bool:
+    """Whether an array is a range image, or a map of labels, of integers."""
+    array = read_numbers(path)
+    return array.ndim == 3 or (array.ndim == 2 and array.dtype.kind in "iu")
+
+
+def _read_labels(path: Path, ids: np.ndarray, target: Sensor) -> Partial:
+    """A map of labels, SemanticKITTI's ids, (H, W), of rays that were not measured."""
+    if ids.shape != target.shape:
+        size = "x".join(map(str, target.shape))
+        found = "x".join(map(str, ids.shape))
+        raise InputError(f"{path} is a map of labels of {found}, those of the model are {size}.")
+    image = np.zeros((3, *target.shape), np.float32)
+    image[2] = common_classes(ids)
+    if not image.any():
+        raise InputError(f"{path} has no label: 0 is a ray whose class is not known.")
+    return Partial(image, np.full(target.shape, Ray.UNKNOWN, np.uint8))
+
+
+def _read_image(path: Path, source: Sensor | None, target: Sensor, labels: bool) -> Partial:
     stored = read_numbers(path)
+    if stored.ndim == 2:
+        check(labels, f"{path} is a map of labels: give a model with labels, -c labels.")
+        return _read_labels(path, stored, target)
     found = f"found {stored.dtype} {stored.shape}"
     other = f"{path} must be a range image of floats (2 or 1, H, W), {found}."
     check(stored.dtype.kind == "f" and len(stored) in (1, 2) and stored.size, other)

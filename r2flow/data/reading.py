@@ -11,7 +11,7 @@ import numpy as np
 
 from r2flow.base.errors import InputError, naming, warn_odd
 from r2flow.lidar.estimation import FULL_REFLECTANCE, OUTLIERS, SURE, full_reflectance
-from r2flow.lidar.labels import read_labels
+from r2flow.lidar.labels import common_classes, labels_beside, read_labels
 from r2flow.lidar.projection import Convention, Projection, project_indices, scatter
 from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
 from r2flow.lidar.sensors import Sensor
@@ -43,6 +43,7 @@ class Reading:
     #: Whether images have reflectance: True requires it of every scan; `auto`: see
     #: `lacks_reflectance`.
     reflectance: bool | str = AUTO
+    labels: bool = False  #: whether images end with the common class of each ray
     #: Treatment of unusable scans. `error` raises; `skip` takes the next usable scan; `empty`
     #: raises, but returns an empty image for a scan without a return in the sensor's view.
     on_bad_scan: str = "empty"
@@ -120,6 +121,15 @@ def read_labelled_scan(path: Path, file: Path, reading: Reading) -> tuple[np.nda
     return image, scatter(reading.sensor, pixels, [labels])[0].astype(np.uint16)
 
 
+def _with_labels(path: Path, reading: Reading) -> np.ndarray:
+    """The image of a scan with the common class of each ray as its last channel."""
+    file = labels_beside(path)
+    if file is None:
+        raise InputError(f"{path} has no labels: there is no {path.stem}.label for it.")
+    image, ids = read_labelled_scan(path, file, reading)
+    return np.concatenate([image, common_classes(ids)[None]])
+
+
 def _no_reflectance(path: str | Path) -> InputError:
     return InputError(
         f"{path} has no reflectance, and other scans, a metric or the model need it. Give scans "
@@ -184,7 +194,7 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
     channels = 1 + bool(reading.reflectance)
     image = read_range_image(path)
     if image is None:
-        return read_projected(path, reading)[0]
+        return _with_labels(path, reading) if reading.labels else read_projected(path, reading)[0]
     if image.shape[1:] != reading.sensor.shape:
         size = "x".join(map(str, image.shape[1:]))
         raise InputError(

@@ -26,6 +26,7 @@ from r2flow.base.files import cache_folder
 from r2flow.base.progress import track
 from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
 from r2flow.lidar.estimation import Doubt, is_unclear, other_sensor
+from r2flow.lidar.labels import common_classes
 from r2flow.lidar.scan_files import Points, read_points, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.turns import SEVERAL, turns
@@ -335,6 +336,7 @@ class SimulatedScans(MadeScans):
     seed: int
     numbers: Sequence[int]
     reflectance: bool
+    labels: bool = False  # whether images end with the common class of each ray
 
     def about(self) -> dict[str, Any]:
         return {
@@ -342,6 +344,7 @@ class SimulatedScans(MadeScans):
             "seed": self.seed,
             "scenes": len(self),
             "reflectance": self.reflectance,
+            "labels": self.labels,
         }
 
     def identity(self) -> dict[str, Any]:
@@ -374,9 +377,9 @@ class SimulatedScans(MadeScans):
         return f"simulator {simulator.REVISION}"
 
     def __getitem__(self, index: int) -> np.ndarray:
-        return simulator.simulate(self.sensor, self.seed, self.numbers[index]).image[
-            : 1 + self.reflectance
-        ]
+        scan = simulator.simulate(self.sensor, self.seed, self.numbers[index])
+        image = scan.image[: 1 + self.reflectance]
+        return np.concatenate([image, common_classes(scan.labels)[None]]) if self.labels else image
 
 
 class InMemory(ScanSource):

@@ -92,7 +92,9 @@ class SampledScans(MadeScans):
         return replace(self, numbers=[self.numbers[i] for i in indices])
 
     def batch(self, indices: Sequence[int]) -> Tensor:
-        """Sample a batch, (B, 2 or 1, H, W); unconverged samples are included and counted."""
+        """Sample a batch, (B, 2 or 1, H, W), without labels; unconverged samples are included and
+        counted.
+        """
         numbers = [self.numbers[i] for i in indices]
         batch = draw(
             self.flow.generator, numbers, self.seed, self.sampler, precision=self.precision
@@ -100,7 +102,7 @@ class SampledScans(MadeScans):
         self.seconds.append(batch.seconds / len(indices))
         self.evaluations += batch.evaluations.tolist()
         self.unsolved += int((~batch.converged).sum())
-        return batch.images.nan_to_num(0.0)
+        return batch.images[:, :2].nan_to_num(0.0)
 
 
 def reference_sets(

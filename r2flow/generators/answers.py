@@ -21,6 +21,7 @@ class Answers:
     scales: Tensor  # scale b of each candidate's Laplace density on log r, (B, 7, H, W)
     returns: Tensor  # logit of a return, (B, 1, H, W)
     strengths: Tensor  # reflectance of each candidate, (B, 7, H, W)
+    labels: Tensor  # log probability of each class, given a return, (B, K, H, W); K = 0 without
 
     def log_density(self, log_r: Tensor) -> Tensor:
         """log p(log r | return), (B, 1, H, W)."""

@@ -30,9 +30,11 @@ def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
     `known` is 1 for measured values; `image` is 0 for rays that were not measured.
 
     Args:
-        images: Range in metres and optionally reflectance, (B, 2 or 1, H, W); 0 without a return.
-            Without the reflectance channel, the reflectance of returns is unknown, that of empty
-            rays is known.
+        images: Range in metres, optionally reflectance, then optionally common classes, (B, 1 to 3,
+            H, W); 0 without a return. Without the reflectance channel, or where there are classes
+            and reflectance is 0 throughout, the reflectance of returns is unknown, that of empty
+            rays is known. A label is known where its class is above 0, also of a ray that was not
+            measured.
         state: `r2flow.lidar.known.Ray` of each ray, (B, H, W).
 
     Raises:
@@ -41,9 +43,10 @@ def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
     _, rows, columns = space.shape
     found = (tuple(images.shape), tuple(state.shape))
     if found[0][2:] != (rows, columns) or found[1] != (len(images), rows, columns):
+        sizes = f"1 to {len(space.encoding.slices)}"
         raise InputError(
-            f"the images to complete must be (B, 2 or 1, {rows}, {columns}) and the states of the "
-            f"rays (B, {rows}, {columns}), found {found[0]} and {found[1]}."
+            f"the images to complete must be (B, {sizes}, {rows}, {columns}) and the states of "
+            f"the rays (B, {rows}, {columns}), found {found[0]} and {found[1]}."
         )
     measured = state != Ray.UNKNOWN
     expected = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.EMPTY))
@@ -53,13 +56,17 @@ def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
             "of 0, and Ray.UNKNOWN for a ray that was not measured."
         )
     measured = measured[:, None]
-    silent = space.encoding.reflectance and images.shape[1] == 1
-    metres = torch.cat([images, torch.zeros_like(images)], 1) if silent else images
+    channels = space.encoding.slices
+    absent = images.new_zeros(len(images), max(len(channels) - images.shape[1], 0), rows, columns)
+    metres = torch.cat([images, absent], 1)
     image = space.encoding.encode(metres)
     known = measured.expand_as(image).to(image)
-    if silent:
-        known[:, -1] *= images[:, 0] <= 0
-    return {IMAGE: torch.where(measured, image, 0), KNOWN: known}
+    if space.encoding.reflectance and images.shape[1] != 2:
+        silent = (metres[:, 1] == 0).flatten(1).all(1)[:, None, None]
+        known[:, 1] *= ~(silent & (images[:, 0] > 0))
+    if space.encoding.labels:
+        known[:, channels["label"]] = (metres[:, 2:3] > 0).to(image)
+    return {IMAGE: torch.where(measured | (known > 0), image, 0), KNOWN: known}
 
 
 def autocast(device: torch.device, precision: Precision) -> AbstractContextManager[Any]:

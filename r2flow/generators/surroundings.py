@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from r2flow.generators.base import IMAGE, KNOWN, Condition
 from r2flow.lidar.encoding import ModelSpace
+from r2flow.lidar.labels import COMMON
 
 FEATURES = 31  # of `Surroundings`
 ROW = 8  # size of the vector learned for each row
@@ -36,6 +37,7 @@ class Surroundings(NamedTuple):
     there: Tensor  # which candidates exist, (B, 6, H, W) bool
     guess: Tensor  # log r of the best candidate, (B, 1, H, W)
     start: Tensor  # measured rays, else the best candidate, in model space, (B, C, H, W)
+    labelled: Tensor  # which rays have a known label, (B, 1, H, W); of no channel without labels
     sure: Tensor  # 1: a measured return, -1: measured as empty, 0: a hidden ray, (B, 1, H, W)
 
     @classmethod
@@ -53,9 +55,13 @@ class Surroundings(NamedTuple):
         measured = known[:, :1]
         metres = space.decode(image) * measured
         r = metres[:, :1]
+        channels = space.encoding.slices
+        loud = known[:, channels.get("reflectance", channels["range"])]
         strength = torch.zeros_like(r)
         if space.encoding.reflectance:
-            strength = metres[:, 1:2] * known[:, -1:]
+            strength = metres[:, 1:2] * loud
+        planes = channels.get("label", slice(0, 0))
+        labelled = known[:, planes][:, :1]
         returned = r > 0
         log_r = torch.where(returned, r, 1.0).log()
         offsets = nearest_returns(returned[:, 0], steps, ring).transpose(0, 2)  # (B, 2, 4, H, W)
@@ -86,15 +92,18 @@ class Surroundings(NamedTuple):
             relative[:, 4:],
             measured,
             returned,
-            known[:, -1:],
+            loud,
             ((log_r - guess) * returned).clamp(-3, 3),
             strength,
             ~any_present,
             guess / 3 - 1,
         ]
-        start = torch.where(measured > 0, image, start)
+        start = torch.where(measured > 0, image[:, : start.shape[1]], start)
+        even = 2 / len(COMMON) - 1  # all classes are equally likely
+        start = torch.cat([start, torch.where(labelled > 0, image[:, planes], even)], 1)
         sure = measured * torch.where(returned, 1, -1)
-        return cls(torch.cat(features, 1), ranges, strengths, present, guess, start, sure)
+        together = torch.cat(features, 1)
+        return cls(together, ranges, strengths, present, guess, start, labelled, sure)
 
 
 class RowFeatures(nn.Embedding):
@@ -138,24 +147,25 @@ def steps_of(elevations: Tensor, column: float) -> Tensor:
 
 
 def encoded(space: ModelSpace, r: Tensor, strength: Tensor) -> Tensor:
-    """Range in metres and reflectance, (B, 1, H, W) each, in model space, (B, C, H, W)."""
+    """Range in metres and reflectance, (B, 1, H, W) each, in model space, (B, 2 or 1, H, W)."""
     if space.encoding.reflectance:
         r = torch.cat([r, strength.clamp(0, 1)], 1)
-    return space.encoding.encode(r)
+    return space.encoding.encode_returns(r)
 
 
 def gain_of(space: ModelSpace, image: Tensor, known: Tensor) -> Tensor:
     """Factor to a scan's mean reflectance of `_REFLECTANCE`, (B, 1, 1, 1); 1 if none is known."""
     metres = space.decode(image)
-    returned = (known[:, -1:] > 0) & (metres[:, :1] > 0)
-    total = (metres[:, 1:] * returned).sum((1, 2, 3), keepdim=True)
+    returned = (known[:, 1:2] > 0) & (metres[:, :1] > 0)
+    total = (metres[:, 1:2] * returned).sum((1, 2, 3), keepdim=True)
     count = returned.sum((1, 2, 3), keepdim=True)
     return torch.where(total > 0, _REFLECTANCE * count / total, 1.0)
 
 
 def scaled(image: Tensor, gain: Tensor) -> Tensor:
     """An image in model space, (B, C, H, W), with its reflectance multiplied, at most 1."""
-    return torch.cat([image[:, :-1], ((image[:, -1:] + 1) * gain).clamp(max=2) - 1], 1)
+    strength = ((image[:, 1:2] + 1) * gain).clamp(max=2) - 1
+    return torch.cat([image[:, :1], strength, image[:, 2:]], 1)
 
 
 def within_reach(known: Tensor) -> Tensor:

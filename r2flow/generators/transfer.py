@@ -34,6 +34,7 @@ from r2flow.generators.surroundings import (
     within_reach,
 )
 from r2flow.lidar.encoding import ModelSpace
+from r2flow.lidar.labels import COMMON
 from r2flow.samplers import Jump
 
 _LAST = 1e-5  # smallest 1 - t that the velocity is divided by
@@ -45,7 +46,7 @@ _SHIFT = 0.02
 _FOREIGN = 0.5
 # Other sensors: low rays are not lost as those that the training sensor's own car hides.
 _RAISED = math.radians(3)
-WEIGHTS = {"range": 1.0, "return": 2.0, "reflectance": 4.0}  # loss weights
+WEIGHTS = {"range": 1.0, "return": 2.0, "reflectance": 4.0, "label": 1.0}  # loss weights
 
 
 class TransferFlow(Flow):
@@ -63,6 +64,9 @@ class TransferFlow(Flow):
     The sampler `transport` draws diverse completions. Known rays are returned bit for bit. Images
     can have any size and sensor (`at`).
 
+    With labels, each channel of a ray is known or hidden by itself: labels of scans, scans of
+    labels. The network gives a probability p of each class, and E[x_1] = 2 p - 1 in its plane.
+
     Args:
         backbone: Name and options of a backbone for any size, as in conf/backbone/local.yaml.
         sigma: Standard deviation of the noise in x_0, in model space.
@@ -78,8 +82,10 @@ class TransferFlow(Flow):
     ) -> None:
         super().__init__(space)
         self.sigma = sigma
-        inputs = space.shape[0] + FEATURES + RowFeatures.FEATURES
-        self.backbone = build_backbone(backbone, space.rays, inputs, 3 * _CANDIDATES + 2)
+        inputs = space.shape[0] + FEATURES + RowFeatures.FEATURES + space.encoding.labels
+        self.classes = len(COMMON) if space.encoding.labels else 0
+        outputs = 3 * _CANDIDATES + 2 + self.classes
+        self.backbone = build_backbone(backbone, space.rays, inputs, outputs)
         self.backbone.refuse_parametrised(type(self).__name__)
         if not self.backbone.any_size:
             raise InputError(
@@ -92,15 +98,26 @@ class TransferFlow(Flow):
         self.foreign = False  # whether the scans are of another sensor than the training scans
 
     def start_from(self, parent: Generator) -> None:
-        """Copy a transfer flow's weights.
+        """Copy a transfer flow's weights; those of labels that it does not know begin at 0.
 
         For a sensor with other beams, each row starts from the shared vector.
         """
         weights = parent.state_dict()
+        if isinstance(parent, TransferFlow) and not parent.classes:
+            weights = {name: self._widened(name, weight) for name, weight in weights.items()}
         beams = parent.rows.elevations if isinstance(parent, TransferFlow) else None
         if beams is not None and not torch.equal(self.rows.elevations, beams):
             weights["rows.weight"] = weights["rows.weight"][:1].expand_as(self.rows.weight)
         self._take(parent, {**weights, "backbone.coords": self.backbone.coords})
+
+    def _widened(self, name: str, weight: Tensor) -> Tensor:
+        """A parent's weight with zeros for the channels of labels, which are the last."""
+        if not name.startswith(("backbone.image.", "backbone.answer.")):
+            return weight
+        own = self.get_parameter(name)
+        wide = torch.zeros_like(own)
+        wide[tuple(map(slice, weight.shape))] = weight
+        return wide
 
     def at(self, space: ModelSpace, numbered: bool = True) -> Self:
         """This flow for another sensor; `numbered`: use the vectors learned per row."""
@@ -119,13 +136,23 @@ class TransferFlow(Flow):
         `rows` are of `RowFeatures`.
         """
         rows = rows.expand(len(x), -1, *x.shape[2:])
-        inputs = torch.cat([x - about.start, about.features, rows], 1)
+        returns = x.shape[1] - self.classes  # channels of range and reflectance
+        inputs = torch.cat(
+            [
+                (x - about.start)[:, :returns],
+                about.features,
+                rows,
+                x[:, returns:],
+                about.labelled,
+            ],
+            1,
+        )
         output = self.backbone(t, inputs).float()
+        output, labels = output.tensor_split([3 * _CANDIDATES + 2], 1)
         correction = output[:, -1:]
         if self.foreign:
-            # The elevation, among the last inputs.
-            inputs[:, ROW - RowFeatures.FEATURES] += STEEP * _RAISED
-            output[:, -2] = self.backbone(t, inputs).float()[:, -2]
+            inputs[:, returns + FEATURES + ROW] += STEEP * _RAISED  # the elevation
+            output[:, -2] = self.backbone(t, inputs).float()[:, 3 * _CANDIDATES]
             correction = correction * _FOREIGN
         logits, shifts, scales = output[:, :-2].chunk(3, 1)
         # The interpolations are likelier at first.
@@ -139,8 +166,8 @@ class TransferFlow(Flow):
         strengths = torch.cat([about.strengths, nearest], 1) + correction
         if not self.training:
             strengths = strengths.clamp(0, 1)
-        returns = torch.where(about.sure != 0, -NEVER * about.sure, output[:, -2:-1] + 1)
-        return Answers(logits, ranges, scales, returns, strengths)
+        sure = torch.where(about.sure != 0, -NEVER * about.sure, output[:, -2:-1] + 1)
+        return Answers(logits, ranges, scales, sure, strengths, labels.log_softmax(1))
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         return self.mean_velocity(t, x, torch.zeros(()), condition)
@@ -177,7 +204,7 @@ class TransferFlow(Flow):
         strength = answers.strengths.gather(1, k)
         returned = u < p
         x_1 = encoded(self.space, self._within(log_r) * returned, strength * returned)
-        return _with_known(condition, x_1)
+        return _with_known(condition, _labelled(x_1, answers, returned))
 
     def _answered(self, t: Tensor, x: Tensor, condition: Condition) -> Answers:
         about = Surroundings(*(condition[name] for name in Surroundings._fields))
@@ -187,7 +214,8 @@ class TransferFlow(Flow):
         r = self._within(answers.ranges.gather(1, answers.least_error()))
         strength = (answers.logits.exp() * answers.strengths).sum(1, keepdim=True)
         returned = answers.returns > 0
-        return encoded(self.space, r * returned, strength * returned)
+        x_1 = encoded(self.space, r * returned, strength * returned)
+        return _labelled(x_1, answers, returned)
 
     def _mean(self, answers: Answers) -> Tensor:
         p = answers.logits.exp()
@@ -195,12 +223,13 @@ class TransferFlow(Flow):
         r = self._within(answers.ranges).flatten(0, 1)
         each = encoded(self.space, r[:, None], answers.strengths.flatten(0, 1)[:, None])
         mean = (each.unflatten(0, p.shape[:2]) * p[:, :, None]).sum(1)
-        return q * mean + (1 - q) * self._empty(q)
+        return q * _labelled(mean, answers) + (1 - q) * self._empty(q)
 
     def _empty(self, like: Tensor) -> Tensor:
         """Rays without a return in model space, (B, C, H, W), in the type of (B, 1, H, W)."""
         zeros = torch.zeros_like(like)
-        return encoded(self.space, zeros, zeros)
+        planes = like.new_full((len(like), self.classes, *like.shape[2:]), -1)
+        return torch.cat([encoded(self.space, zeros, zeros), planes], 1)
 
     def _within(self, log_r: Tensor) -> Tensor:
         sensor = self.space.sensor
@@ -233,7 +262,7 @@ class TransferFlow(Flow):
         x = generated.x.to(image)
         if gain is not None:
             x = scaled(x, 1 / gain)
-        x = torch.where(within_reach(known[:, :1]), x, self._empty(image[:, :1]))
+        x = torch.where(within_reach(known.amax(1, True)), x, self._empty(image[:, :1]))
         x = torch.where(known > 0, image, x)
         evaluations = generated.evaluations * (2 if self.foreign else 1)  # see `answers`
         return replace(generated, x=x, evaluations=evaluations)
@@ -249,9 +278,9 @@ class TransferFlow(Flow):
     ) -> Mapping[str, Tensor]:
         """Losses over the hidden rays, by name (`WEIGHTS`).
 
-        They are the negative log-likelihoods of log r and of a return, and the mean |error| of
-        reflectance. In training each is the mean over the rays of the batch (of an accumulated
-        part), on all devices, in eval mode the mean over the scans' own losses.
+        They are the negative log-likelihoods of log r, of a return and of a label, and the mean
+        |error| of reflectance. In training each is the mean over the rays of the batch (of an
+        accumulated part), on all devices, in eval mode the mean over the scans' own losses.
 
         Args:
             x_1: Crops, (B, C, H, W), that do not span a full turn.
@@ -286,7 +315,17 @@ class TransferFlow(Flow):
         if self.space.encoding.reflectance:
             errors = answers.logits.detach().exp() * (answers.strengths - metres[:, 1:2]).abs()
             losses["reflectance"] = mean(errors.sum(1, keepdim=True), returned & hidden)
+        if self.classes:
+            share = (x_1[:, -self.classes :] + 1) / 2
+            entropy = -(share * answers.labels).sum(1, keepdim=True)
+            labelled = share.any(1, keepdim=True) & (known[:, -1:] < 1)
+            losses["label"] = mean(entropy, returned & labelled)
         return losses
+
+
+def _labelled(x: Tensor, answers: Answers, returned: Tensor | float = 1.0) -> Tensor:
+    """Range and reflectance with the mean of each plane of labels; no label without a return."""
+    return torch.cat([x, 2 * answers.labels.exp().to(x) * returned - 1], 1)
 
 
 def _with_known(condition: Condition, x: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ import torch
 from numpy import ndarray
 from torch import Tensor
 
+from r2flow.base.errors import InputError
 from r2flow.base.registry import (
     Bound,
     Registry,
@@ -18,11 +19,13 @@ from r2flow.base.registry import (
     options_of,
     presets,
 )
+from r2flow.lidar.labels import COMMON
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor, build_sensor
 
 LIMIT_TOLERANCE = 1e-5  # relative, of closed range limits in decoding, for float32's rounding
 FULL = 1 + 1e-3  # maximum reflectance; larger values mean another scale
+LEAST = 0.05  # probability of a decoded label; all planes of a ray without label are -1
 FAR = 300.0  # metres, above any scan's median range, unless its sensor has a larger limit
 
 
@@ -116,6 +119,8 @@ class Encoding:
             are not.
         levels: Decoded reflectance is rounded to n / levels, as the sensor reports it; None: it is
             not rounded.
+        labels: Whether labels are channels, a plane for each class of `r2flow.lidar.labels.COMMON`;
+            with reflectance alone.
     """
 
     def __init__(
@@ -126,9 +131,13 @@ class Encoding:
         limits: Literal["closed", "open"] = "closed",
         levels: Annotated[float, Bound("whole and above 0", lambda n: n > 0 and n % 1 == 0)]
         | None = None,
+        labels: bool = False,
     ) -> None:
+        if labels and not reflectance:
+            raise InputError("encoding.labels needs encoding.reflectance, and scans that have it.")
         self.sensor = sensor
         self.reflectance = reflectance
+        self.labels = labels
         self.limits = limits
         self.levels = levels
         self.format = FORMATS[format](sensor)
@@ -140,6 +149,7 @@ class Encoding:
             "reflectance": self.reflectance,
             "limits": self.limits,
             "levels": self.levels,
+            "labels": self.labels,
         }
 
     def through(self, sensor: Sensor) -> "Encoding":
@@ -151,8 +161,24 @@ class Encoding:
         return other
 
     @property
+    def slices(self) -> dict[str, slice]:
+        """The channels of model space by name: range, reflectance and label, as far as it has them.
+
+        Those of an image in metres are as many, each of one channel.
+        """
+        sizes = {"range": 1, "reflectance": int(self.reflectance)}
+        if self.labels:
+            sizes["label"] = len(COMMON)
+        ends = np.cumsum([*sizes.values()])
+        return {
+            name: slice(int(end) - size, int(end))
+            for (name, size), end in zip(sizes.items(), ends, strict=True)
+            if size
+        }
+
+    @property
     def channels(self) -> int:
-        return 1 + int(self.reflectance)
+        return [*self.slices.values()][-1].stop
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -160,12 +186,21 @@ class Encoding:
         return self.channels, *self.sensor.shape
 
     def encode(self, image: Tensor) -> Tensor:
-        """Map range in metres and reflectance in [0, 1] to model space.
+        """Map range in metres, reflectance in [0, 1] and common class to model space.
 
-        Shapes are (..., 2 or 1, H, W) and (..., channels, H, W).
+        Shapes are (..., 1 to 3, H, W), of the channels in `slices`, and (..., channels, H, W).
         A range outside the limits is a dropped ray, which becomes exactly -1 in both channels, or
-        nearly under `shifted_log`; values are clipped to [-1, 1]. NaN stays.
+        nearly under `shifted_log`; values are clipped to [-1, 1]. NaN stays. The plane of a ray's
+        class is 1, others are -1.
         """
+        x = self.encode_returns(image)
+        if self.labels:
+            classes = torch.arange(1, len(COMMON) + 1, device=x.device)[:, None, None]
+            x = torch.cat([x, (image[..., 2:3, :, :] == classes).to(x) * 2 - 1], dim=-3)
+        return x
+
+    def encode_returns(self, image: Tensor) -> Tensor:
+        """Range and reflectance alone, as `encode`, (..., 2 or 1, H, W)."""
         r = image[..., :1, :, :]
         returned = self._is_return(r)
         y = self.format.forward(torch.where(returned | r.isnan(), r, 0.0))
@@ -183,7 +218,7 @@ class Encoding:
         """Map (..., channels, H, W) to range in metres and reflectance, (..., 2 or 1, H, W).
 
         Ranges outside the limits are dropped rays, 0 in both; reflectance is clamped to [0, 1] and
-        rounded to `levels`.
+        rounded to `levels`. With `labels` there follow the likeliest class and its probability.
         """
         y = (x + 1) / 2
         r = self.format.inverse(y[..., :1, :, :])
@@ -191,10 +226,17 @@ class Encoding:
         near = self.sensor.min_range * (1 + 1e-6)  # also the rounded points are within the limits
         image = torch.where(returned, r.clamp(near, self.sensor.max_range * (1 - 1e-6)), 0.0)
         if self.reflectance:
-            reflectance = y[..., 1:, :, :].clamp(0, 1)
+            reflectance = y[..., 1:2, :, :].clamp(0, 1)
             if self.levels is not None:
                 reflectance = (reflectance * self.levels).round() / self.levels
             image = torch.cat([image, torch.where(returned, reflectance, 0.0)], dim=-3)
+        if self.labels:
+            probability, label = y[..., self.slices["label"], :, :].max(-3, keepdim=True)
+            labelled = returned & (probability > LEAST)
+            label = torch.where(labelled, label + 1, 0)
+            image = torch.cat(
+                [image, label.to(image), torch.where(labelled, probability, 0.0)], dim=-3
+            )
         return image
 
     def _is_return(self, r: Tensor) -> Tensor:

@@ -1,4 +1,6 @@
-"""Semantic labels of scans: SemanticKITTI's `.label` files and ids, and PandaSet's."""
+"""Semantic labels of scans: SemanticKITTI's `.label` files and ids, PandaSet's, and the common
+classes of labelled models.
+"""
 
 from pathlib import Path
 
@@ -6,8 +8,13 @@ import numpy as np
 from numpy import ndarray
 
 from r2flow.base.errors import InputError
-from r2flow.base.files import reading
-from r2flow.lidar.scan_files import LARGEST_FILE, TABLE_ENDINGS, Points, pandaset
+from r2flow.base.files import atomic_write, reading
+from r2flow.lidar.scan_files import (
+    LARGEST_FILE,
+    TABLE_ENDINGS,
+    Points,
+    pandaset,
+)
 
 # SemanticKITTI's ids: name, and the colour in pictures (ground grey to violet, vehicles blue,
 # people red, plants green, buildings and fences brown; moving objects as static ones).
@@ -51,6 +58,33 @@ CLASSES = {
 # Ids by SemanticKITTI's spelling of the names.
 LABELS = {name.replace(" ", "-"): label for label, (name, _) in CLASSES.items()}
 
+# The classes 1, 2, ... of a labelled model, which all data sets have. In files, the first id stands
+# for its class; 0 is no label.
+COMMON = {
+    "road": (40, 44, 60),
+    "sidewalk": (48,),
+    "terrain and vegetation": (70, 72, 49),
+    "building": (50, 51),
+    "pole": (80, 71, 81),
+    "vehicle": (10, 11, 13, 15, 16, 18, 20, 252, 256, 257, 258, 259),
+    "person": (30, 31, 32, 253, 254, 255),
+    "other": (99, 52),
+}
+_IDS = np.array([0, *(ids[0] for ids in COMMON.values())], np.uint16)
+_COMMON = np.zeros(2**16, np.float32)
+for _number, _members in enumerate(COMMON.values(), 1):
+    _COMMON[list(_members)] = _number
+
+
+def common_classes(ids: ndarray) -> ndarray:
+    """The common class of SemanticKITTI's ids, float32; 0 for those that have none."""
+    return _COMMON[np.asarray(ids).clip(0, 2**16 - 1)]
+
+
+def semantic_ids(classes: ndarray) -> ndarray:
+    """The SemanticKITTI id that stands for each common class, uint16."""
+    return _IDS[classes.astype(np.uint8)]
+
 
 def labels_beside(scan: str | Path) -> Path | None:
     """The label file of a scan, or None.
@@ -68,6 +102,16 @@ def labels_beside(scan: str | Path) -> Path | None:
         files.append(folder.parent / "labels" / file.name)
     # A broken link is taken: reading it raises.
     return next((path for path in files if path.exists() or path.is_symlink()), None)
+
+
+def write_labels(folder: Path, name: str, classes: ndarray, probability: ndarray) -> None:
+    """Write `NAME.label` of points' common classes, as SemanticKITTI's ids, and their probabilities
+    as `NAME.probability.npz`.
+    """
+    with atomic_write(folder / f"{name}.probability.npz") as file:
+        np.savez_compressed(file, probability=probability.astype(np.float16))
+    with atomic_write(folder / f"{name}.label") as file:
+        file.write(semantic_ids(classes).astype("<u4").tobytes())
 
 
 def read_labels(path: Path, scan: str | Path, points: Points) -> ndarray:

@@ -39,7 +39,8 @@ WHOLE = 0.9  # minimum share of the rays of a turn that a file with all lost ray
 class Partial:
     """A partially measured image."""
 
-    image: ndarray  # range in metres and, if measured, reflectance, (2 or 1, H, W) float32
+    # range in metres and, if measured, reflectance and common class, (1 to 3, H, W) float32
+    image: ndarray
     state: ndarray  # `Ray` of each ray, (H, W) uint8
     xyz: ndarray | None = None  # measured points of the returns in metres, (3, H, W) float32
     points: Points | None = None  # all points of the scan's file; the image has the nearest ones
@@ -154,14 +155,14 @@ def points_of_same(
 def image_of_same(image: ndarray, target: Sensor) -> Partial:
     """The measured image from an image of the same sensor; rays without a return are empty.
 
-    Images are (2 or 1, H, W).
+    Images are (1 to 3, H, W), with labels the last.
     """
     r = image[0]
     returned = (r >= target.min_range) & (r <= target.max_range)
     state = _state_of(returned)
     state[(r > 0) & (r < target.min_range)] = Ray.UNKNOWN
     kept = np.where(returned, image, np.float32(0))
-    kept[1:] = kept[1:].clip(0, 1)
+    kept[1:2] = kept[1:2].clip(0, 1)
     return Partial(kept, state)
 
 

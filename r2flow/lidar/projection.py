@@ -209,6 +209,16 @@ def image_to_points(
     Returns:
         Points in metres, (N, 3), and reflectance, (N,), float32; N is the number of returns.
     """
+    xyz, values = image_points(image, rays, measured)
+    return xyz, values[0] if len(values) else np.zeros(len(xyz), np.float32)
+
+
+def image_points(
+    image: ndarray, rays: Tensor | ndarray | Sensor | str, measured: ndarray | None = None
+) -> tuple[ndarray, ndarray]:
+    """The returns of an image, (N, 3), as `image_to_points`, and all its further channels, (C - 1,
+    N).
+    """
     if isinstance(rays, Sensor | str):
         rays = named_sensor(rays).rays()
     rays = torch.as_tensor(rays)
@@ -216,19 +226,19 @@ def image_to_points(
     xyz = unproject(torch.from_numpy(r)[None], rays)[0].numpy()
     if measured is not None:
         xyz = np.where(measured.any(axis=0), measured, xyz)
-    reflectance = image[1:] if len(image) > 1 else np.zeros_like(r)
     # By azimuth, not from the middle column: a ring of `reference` rays begins one column later.
     order = torch.argsort(rays[1, 0] % (2 * pi)).cpu().numpy()
-    *axes, strength, r = np.concatenate([xyz, reflectance, r])[..., order]
-    return np.stack(axes, -1)[r > 0], strength[r > 0]
+    returned = r[0][:, order] > 0
+    values = np.concatenate([xyz, image[1:]])[..., order][:, returned]
+    return values[:3].T, values[3:]
 
 
 def write_scan(image: ndarray, rays: Tensor, out: Path, name: str, endings: Sequence[str]) -> None:
     """Write a range image as `out/NAME.ENDING`: the image in .npy, points in other formats."""
-    xyz, reflectance = image_to_points(image, rays)
+    xyz, values = image_points(image, rays)
     for ending in endings:
         path = out / f"{name}.{ending}"
         if ending == "npy":
             save_array(path, image)
         else:
-            write_points(path, xyz, reflectance if len(image) > 1 else None)
+            write_points(path, xyz, values[0] if len(values) else None)

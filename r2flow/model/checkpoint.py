@@ -158,7 +158,8 @@ class Checkpoint:
         that sees past its own.
         """
         named = None if sensor is None else named_sensor(sensor)
-        scans, remarks = open_partial(specs, reading_for([], self, columns=columns), named, **how)
+        reading = reading_for([], self, columns=columns, labels=self.encoding.labels)
+        scans, remarks = open_partial(specs, reading, named, **how)
         transfers = isinstance(self.generator, TransferFlow)
         views = {scan.whole for scan in scans}
         if keep_beams and transfers and len(views) == 1 and (view := views.pop()):

@@ -14,7 +14,7 @@ from r2flow.base.errors import InputError, check
 from r2flow.generators import Flow, Generator, Sampler, TransferFlow, condition_of
 from r2flow.generators.base import Precision, Progress
 from r2flow.lidar.encoding import LIMIT_TOLERANCE, wrong_with
-from r2flow.lidar.known import Ray
+from r2flow.lidar.known import Ray, ray_states
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.sampling import HasGenerator, Samples, draw, warn_unsolved
 from r2flow.samplers import Transport, build_sampler, parse_sampler
@@ -108,8 +108,10 @@ def complete(
     Args:
         source: A checkpoint or its generator. Generators with `draws = False` need a known ray in
             each scan.
-        images: Range in metres and optionally reflectance, (B, 2 or 1, H, W), 0 without a return. A
-            model with reflectance adds it to scans without; a model of range alone ignores it.
+        images: Range in metres and optionally reflectance, then common classes, (B, 1 to 3, H, W),
+            0 without a return. A model with reflectance adds it to scans without, a labelled model
+            labels where the class is 0, and ranges where only the class is known; other models
+            ignore what they do not have.
         state: `r2flow.lidar.known.Ray` of each ray, (B, H, W); None: rays without a return count as
             not measured.
         num: Answers per scan.
@@ -146,7 +148,9 @@ def complete(
         condition = {name: value[i : i + 1] for name, value in conditions.items()}
         known = condition["known"] > 0
         any_known = bool(known.any())
-        answers = image.new_zeros(num, 1 + generator.space.encoding.reflectance, *image.shape[1:])
+        encoding = generator.space.encoding
+        returns = 1 + encoding.reflectance
+        answers = image.new_zeros(num, returns + 2 * encoding.labels, *image.shape[1:])
         evaluations = answers.new_zeros(num).long()
         converged = answers.new_ones(num).bool()
         seconds = 0.0
@@ -167,10 +171,19 @@ def complete(
                 drawn.converged,
             )
             seconds += drawn.seconds
-        shared = min(answers.shape[1], image.shape[0])
+        shared = min(returns, image.shape[0])
         answers[:, :shared] = torch.where(measured, image[:shared], answers[:, :shared])
         warn_unsolved(converged, of=f" of the answers to scan {first + i}")
         yield Completed(answers * (answers[:, :1] > 0), first + i, evaluations, converged, seconds)
+
+
+def label(source: HasGenerator | Generator, images: Tensor, **how: Any) -> Tensor:
+    """Range, reflectance, common class and its probability of each ray, (B, 4, H, W).
+
+    Every ray of the images, (B, 2 or 1, H, W), is known; `how` as for `complete`.
+    """
+    answers = complete(source, images, ray_states(images), **how)
+    return torch.cat([answer.images for answer in answers])
 
 
 def _check_values(sensor: Sensor, images: Tensor) -> None:

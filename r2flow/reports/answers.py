@@ -23,15 +23,16 @@ from r2flow.data.partial import PartialScan
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.lidar.known import Mask, Ray, share_in_sectors
+from r2flow.lidar.labels import write_labels
 from r2flow.lidar.other_sensors import Partial
-from r2flow.lidar.projection import image_to_points
-from r2flow.lidar.scan_files import WRITTEN, write_points
+from r2flow.lidar.projection import image_points
+from r2flow.lidar.scan_files import WRITTEN, scan_ending, write_points
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import Completed, complete
 from r2flow.model.shipped import DEFAULT, DENSIFY
-from r2flow.reports.outputs import recipe_of
+from r2flow.reports.outputs import recipe_of, write_labelled
 from r2flow.reports.pictures import contact_sheet, save_figure
-from r2flow.reports.view import Panel, write_viewer
+from r2flow.reports.view import panel_of, write_viewer
 from r2flow.store import Store, manifest_of
 
 _THREADS = 4  # at most: Python's own work is done by one thread at a time
@@ -45,6 +46,7 @@ class Job:
     seed: int = 0
     mask: Mask | None = None  # measured rays to use; None: all
     fill_gaps: bool = False  # treat rays without a return as unmeasured
+    hide: frozenset[str] = frozenset()  # channels that are drawn anew; range takes all returns
     batch_size: int = 1
     pictures: int = 8  # number of scans with a picture and a 3-D page
     precision: Precision = "32-true"
@@ -63,7 +65,13 @@ def write_completed(
     Scans whose answers are all in the folder are skipped. `about` has the other settings that
     affect the answers, as plain values.
     """
-    settings = {"num": job.num, "fill_gaps": job.fill_gaps, **about, "precision": job.precision}
+    settings = {
+        "num": job.num,
+        "fill_gaps": job.fill_gaps,
+        **about,
+        "precision": job.precision,
+        "hide": sorted(job.hide) or None,
+    }
     recipe = recipe_of(checkpoint, job.seed, sampler, completion=settings)
     store = Store(out, "answers", recipe)
     files = {scan.name: _answer_files(checkpoint, scan, out, job.num) for scan in scans}
@@ -214,6 +222,7 @@ def _known_rays(scan: PartialScan, job: Job, number: int) -> Partial:
     if job.fill_gaps:
         state = np.where(given.state == Ray.EMPTY, np.uint8(Ray.UNKNOWN), given.state)
         given = replace(given, state=state)
+    given = _without(given, job.hide)
     if job.mask is None:
         return given
     measured = given.state != Ray.UNKNOWN
@@ -224,6 +233,21 @@ def _known_rays(scan: PartialScan, job: Job, number: int) -> Partial:
     state = np.where(kept, given.state, np.uint8(Ray.UNKNOWN))
     xyz = None if given.xyz is None else given.xyz * kept
     return Partial(given.image * kept, state, xyz)
+
+
+def _without(given: Partial, hidden: frozenset[str]) -> Partial:
+    """A partial scan without some channels; without ranges, only its labels are left."""
+    image = given.image.copy()
+    if "label" in hidden:
+        image = image[:2]
+    if "reflectance" in hidden:
+        image[1:2] = 0
+    if "range" not in hidden:
+        return replace(given, image=image if image[1:].any() else image[:1])
+    image[:2] = 0
+    if not image.any():
+        raise InputError("without ranges a scan has no known ray: give one with labels.")
+    return Partial(image, np.full_like(given.state, Ray.UNKNOWN))
 
 
 def _write(
@@ -241,22 +265,31 @@ def _write(
             np.savez_compressed(file, deviation=deviation, returned=returned)
     known = given.state == Ray.RETURN
     rays = checkpoint.sensor.rays()
+    labelled = checkpoint.encoding.labels
     for path, image in zip(files, completed.images.numpy(), strict=True):
+        name = path.name.removesuffix(scan_ending(path.name) or path.suffix)
         if scan.image:
-            save_array(path, image)
+            if labelled:
+                write_labelled(image, rays, path.parent, name, ["ply"])
+            save_array(path, image[:2])
             continue
-        measured, strength = image_to_points(image * known, rays, given.xyz)
-        new, estimated = image_to_points(image * ~known, rays)
+        xyz, values = image_points(image * known, rays, given.xyz)
         if given.points is not None:  # in the order of the file
             points = given.points.xyz
-            if given.points.reflectance is None:
-                strength = strength[cKDTree(measured).query(points)[1]]
-            else:
-                strength = given.points.reflectance
-            measured = points
-        xyz = np.concatenate([measured, new])
-        reflectance = np.concatenate([strength, estimated]) if len(image) > 1 else None
-        write_points(path, xyz, reflectance)
+            strength = given.points.reflectance
+            if strength is not None and len(values) == 1:
+                values = strength[None]
+            else:  # those of the nearest ray
+                values = values[:, cKDTree(xyz).query(points)[1]]
+                if strength is not None:
+                    values[:1] = strength
+            xyz = points
+        new, estimated = image_points(image * ~known, rays)
+        xyz = np.concatenate([xyz, new])
+        values = np.concatenate([values, estimated], axis=1)
+        if labelled:
+            write_labels(path.parent, name, *values[1:])
+        write_points(path, xyz, values[0] if len(values) else None)
 
 
 def _draw(
@@ -267,7 +300,7 @@ def _draw(
     answers = completed.images.numpy()[:4]
     images = [given.image, *answers]
     names = ["what is known", *(f"answer {number}" for number in range(len(answers)))]
-    panels = [Panel(name, image[None], rays) for name, image in zip(names, images, strict=True)]
+    panels = [panel_of(name, image[None], rays) for name, image in zip(names, images, strict=True)]
     write_viewer(out / f"{scan.name}.html", panels, scan.name)
     figure = contact_sheet(images, rays, names, given.state == Ray.UNKNOWN)
     save_figure(figure, out / f"{scan.name}.png")

@@ -90,7 +90,8 @@ def completion_rows(
                     progress=progress,
                 )
             )
-            answers[name] = np.stack([result.images.numpy() for result in results])
+            channels = real.shape[1]  # without labels
+            answers[name] = np.stack([result.images[:, :channels].numpy() for result in results])
             cost[name] = {
                 "evaluations": float(np.mean([r.evaluations.float().mean() for r in results])),
                 "seconds": float(np.mean([r.seconds for r in results])) / num,

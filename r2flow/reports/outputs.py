@@ -17,17 +17,20 @@ from r2flow.base.progress import Bar, track
 from r2flow.data.opening import reading_for
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
-from r2flow.lidar.projection import write_scan
+from r2flow.lidar.labels import write_labels
+from r2flow.lidar.projection import image_points, write_scan
 from r2flow.lidar.region import Region
 from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.completion import label
 from r2flow.model.paths import title_of
 from r2flow.model.sampling import draw, warn_unsolved
 from r2flow.model.saving import weights_hash
 from r2flow.reports.pictures import contact_sheet, save_figure, scan_figure
-from r2flow.reports.view import Panel, most_images, write_viewer
+from r2flow.reports.view import most_images, panel_of, write_viewer
 from r2flow.store import MANIFEST, FileStore, read_manifest
 
-_SAMPLES = re.compile(r"\d{6}\.(ply|bin|npy|png)|samples\.(png|html)")  # names of their files
+# names of their files
+_SAMPLES = re.compile(r"\d{6}\.(ply|bin|npy|png|label|probability\.npz)|samples\.(png|html)")
 
 
 def write_samples(
@@ -42,6 +45,7 @@ def write_samples(
     region: Region | None = None,
     replace: bool = False,
     precision: Precision = "32-true",
+    labels: Checkpoint | None = None,
 ) -> Sequence[str]:
     """Sample scans and write each as `out/NNNNNN.FORMAT`, the first ones also as pictures and in
     3-D.
@@ -49,7 +53,8 @@ def write_samples(
     Scan i of a seed is independent of `num` and `batch_size`. A stopped call resumes; `replace`
     deletes samples of other settings in the folder. Files have the sensor's shape, 0 outside the
     region. Formats: `ply` and `bin` are points in metres with reflectance, `npy` is the range
-    image, float32 (2 or 1, H, W); default: all that suit the model. Returns the formats.
+    image, float32 (2 or 1, H, W); default: all that suit the model. `labels`, a labelled model of
+    the same images, adds labels of the points. Returns the formats.
     """
     generator = checkpoint.generator
     sampler = sampler or generator.sampler
@@ -67,6 +72,7 @@ def write_samples(
         sampler,
         region=region and asdict(region),
         precision=None if precision == "32-true" else precision,
+        labels=labels and weights_hash(labels),
     )
     store = FileStore(out, "samples", recipe, endings)
     stale = _stale_files(store, replace)
@@ -86,8 +92,9 @@ def write_samples(
                 stale.pop().unlink()
             if not (done and store.check()):  # `begin` lists the folder
                 store.begin()
-            for number, image in zip(numbers, drawn.images.numpy(), strict=True):
-                write_scan(image, rays, store.folder, f"{number:06d}", endings)
+            images = drawn.images if labels is None else label(labels, drawn.images)
+            for number, image in zip(numbers, images.numpy(), strict=True):
+                write_labelled(image, rays, store.folder, f"{number:06d}", endings)
                 if number < pictures:
                     shown.append(image)
             done += len(numbers)
@@ -102,6 +109,15 @@ def write_samples(
     if shown:
         _draw_samples(shown, rays, store.folder, f"{title_of(checkpoint.path)}, seed {seed}")
     return endings
+
+
+def write_labelled(
+    image: ndarray, rays: Tensor, out: Path, name: str, endings: Sequence[str]
+) -> None:
+    """Write an image by `write_scan`, and the labels of its points, if it has any."""
+    if len(image) > 2:
+        write_labels(out, name, *image_points(image, rays)[1][1:])
+    write_scan(image[:2], rays, out, name, endings)
 
 
 def _stale_files(store: FileStore, replace: bool) -> list[Path]:
@@ -145,7 +161,7 @@ def _draw_samples(images: Sequence[ndarray], rays: Tensor, out: Path, title: str
         save_figure(scan_figure(image, rays, f"sample {index}"), out / f"{index:06d}.png")
     save_figure(contact_sheet(images[:8], rays), out / "samples.png")
     shown = images[: most_images(rays.shape)]
-    panels = [Panel(f"sample {index}", image[None], rays) for index, image in enumerate(shown)]
+    panels = [panel_of(f"sample {index}", image[None], rays) for index, image in enumerate(shown)]
     write_viewer(out / "samples.html", panels, title)
 
 

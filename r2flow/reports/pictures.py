@@ -10,14 +10,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib import colormaps, rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import ListedColormap, to_hex
+from matplotlib.colors import ListedColormap, to_hex, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from matplotlib.text import Text
 from torch import Tensor
 
 from r2flow.base.errors import printable
 from r2flow.base.files import atomic_write
-from r2flow.lidar.labels import CLASSES
+from r2flow.lidar.labels import CLASSES, semantic_ids
 from r2flow.lidar.projection import image_to_points
 
 _WIDTH = 7.16  # inches: two columns of an IEEE paper
@@ -52,18 +53,27 @@ def view_of(*scans: tuple[np.ndarray, Tensor]) -> View:
 
 
 def scan_figure(
-    image: np.ndarray, rays: Tensor, title: str = "", view: View | None = None
+    image: np.ndarray,
+    rays: Tensor,
+    title: str = "",
+    view: View | None = None,
+    labels: np.ndarray | None = None,
 ) -> Figure:
     """Draw one scan, (2 or 1, H, W): its images above, bird's-eye view and perspective below.
 
     `view`: default: that of the scan (`view_of`); `STREET` for all scans makes pictures comparable.
+    `labels`: semantic ids, (H, W); default: those of a labelled model's image.
     """
+    if labels is None and len(image) > 2:
+        labels = semantic_ids(image[2])
+    image = image[:2]
     view = view or view_of((image, rays))
     figure = Figure((_WIDTH, 4.6), facecolor="white")
+    strips = len(image) + (labels is not None)
     grid = figure.add_gridspec(
-        len(image) + 1,
+        strips + 1,
         2,
-        height_ratios=[*[1] * len(image), 5.2],
+        height_ratios=[*[1] * strips, 5.2],
         width_ratios=[1, 1.45],
         hspace=0.28,
         wspace=0.04,
@@ -73,6 +83,8 @@ def scan_figure(
         bottom=0.01,
     )
     _draw_image([figure.add_subplot(grid[row, :]) for row in range(len(image))], image, view)
+    if labels is not None:
+        _draw_labels(figure.add_subplot(grid[-2, :]), labels)
     xyz, _ = image_to_points(image, rays)
     _draw_birds_eye(figure.add_subplot(grid[-1, 0]), xyz, view)
     _draw_perspective(figure.add_subplot(grid[-1, 1]), xyz, view)
@@ -89,11 +101,12 @@ def contact_sheet(
     titles: Sequence[str] = (),
     unmeasured: np.ndarray | None = None,
 ) -> Figure:
-    """Draw several scans in their common view, one per row: images on the left, bird's-eye view and
-    perspective on the right.
+    """Draw several scans in their common view, one per row: range and reflectance on the left,
+    bird's-eye view and perspective on the right.
 
     Rays of the first scan that were not measured, (H, W) bool, are grey.
     """
+    images = [image[:2] for image in images]
     view = view_of(*((image, rays) for image in images))
     height = 1.2 * len(images) + 0.18
     figure = Figure((_WIDTH, height), facecolor="white")
@@ -168,6 +181,25 @@ def _draw_values(
     _frame(axes, title, label, "black")
     if label:
         _add_bar(axes, drawn, ticks)
+
+
+def _draw_labels(axes: Any, labels: np.ndarray) -> None:
+    """Draw semantic ids with a legend of the classes."""
+    classes = class_colours(labels[labels > 0], most=10)
+    colour = np.zeros((*labels.shape, 3))
+    for number, (_, value) in classes.items():
+        colour[labels == number] = to_rgb(value)
+    axes.imshow(colour, aspect="auto", interpolation="nearest")
+    legend = [Patch(color=value, label=name) for name, value in classes.values()]
+    axes.legend(
+        handles=legend,
+        loc="lower left",
+        bbox_to_anchor=(1.0, -0.1),
+        fontsize=4,
+        frameon=False,
+        handlelength=1,
+    )
+    _frame(axes, "label", True, "black")
 
 
 def class_colours(labels: np.ndarray, most: int) -> dict[int, tuple[str, str]]:

@@ -37,6 +37,10 @@ class Tasks:
     silent: Portion = 0.05  # share of crops with unknown reflectance
     # share of crops without the vectors learned per row, for other sensors
     unnumbered: Portion = 0.1
+    # of a model with labels: share of crops where only the labels are hidden, and where only they
+    # are known; of others, half know the labels of known rays
+    labelling: Portion = 0.5
+    drawing: Portion = 0.15
 
     def size(self, space: ModelSpace) -> tuple[int, int]:
         """Rows and columns of a crop, for the space of the run's sensor."""
@@ -67,13 +71,33 @@ class Tasks:
         elevations = elevations[first : first + rows].clone()
         steps = steps_of(elevations[None], 2 * math.pi / x_1.shape[2])[0]
         known = torch.from_numpy(_measured((rows, columns), draws)).expand_as(part).float()
+        known = known.clone()
+        if space.encoding.labels:
+            self._hide(known, part, space, draws)
         if silent < self.silent and space.encoding.reflectance:
-            known = known.clone()
-            known[-1] = 0
+            known[1] = 0
         return {
             "x_1": part, IMAGE: part * known, KNOWN: known, "elevations": elevations,
             "steps": steps, "numbered": torch.tensor(bool(unnumbered >= self.unnumbered)),
         }  # fmt: skip
+
+    def _hide(
+        self, known: Tensor, part: Tensor, space: ModelSpace, draws: np.random.Generator
+    ) -> None:
+        """Hide or give whole channels of a crop, (C, h, w), in place."""
+        kind = draws.random()
+        planes = space.encoding.slices["label"]
+        labels = (part[planes] > 0).any(0)
+        if kind < self.labelling:
+            known[:] = 1
+            known[planes] = 0
+        elif kind < self.labelling + self.drawing:
+            known[:] = 0
+            known[planes] = labels
+        elif draws.random() < 0.5:
+            known[planes] *= labels
+        else:
+            known[planes] = 0
 
 
 def coarser(space: ModelSpace, x: Tensor) -> Tensor:
@@ -138,6 +162,7 @@ class Transfer(SingleLoss):
         images = self.space.decode(batch["x_1"]).cpu()
         state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.EMPTY))
         state[:, torch.arange(images.shape[2]) % 4 != 0] = int(Ray.UNKNOWN)
+        images = images * (state != Ray.UNKNOWN)[:, None]
         answers = complete(self.generator, images, state, seed=self.hparams["seed"])
         return torch.cat([answer.images for answer in answers])
 

@@ -180,15 +180,16 @@ def answers() -> Answers:
     draw = torch.Generator().manual_seed(5)
     ranges, scales, logits = torch.randn(3, 1, 7, 1, 1, generator=draw, dtype=torch.float64)
     nothing = torch.zeros_like(logits)
-    return Answers(logits.log_softmax(1), ranges, scales.abs() / 4 + 0.1, nothing[:, :1], nothing)
+    scales = scales.abs() / 4 + 0.1
+    return Answers(logits.log_softmax(1), ranges, scales, nothing[:, :1], nothing, nothing[:, :0])
 
 
 def test_reflectance_is_the_mean_over_the_candidates(flow):
     p = torch.tensor([0.25, 0.75, 0, 0, 0, 0, 0])[None, :, None, None]
     strengths = torch.linspace(0.1, 0.7, 7)[None, :, None, None]
-    sure = Answers(
-        p.clamp(min=1e-30).log(), 2 + 0 * p, 0 * p + 0.1, torch.ones(1, 1, 1, 1), strengths
-    )
+    returns = torch.ones(1, 1, 1, 1)
+    logits = p.clamp(min=1e-30).log()
+    sure = Answers(logits, 2 + 0 * p, 0 * p + 0.1, returns, strengths, p[:, :0])
     made = flow.space.decode(flow._chosen(sure))[0, :, 0, 0]
     torch.testing.assert_close(made, torch.tensor([math.exp(2), 0.25 * 0.1 + 0.75 * 0.2]))
 

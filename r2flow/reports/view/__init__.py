@@ -25,6 +25,7 @@ from torch import Tensor
 
 from r2flow.base.errors import InputError, printable
 from r2flow.base.files import write_file
+from r2flow.lidar.labels import semantic_ids
 from r2flow.reports.pictures import class_colours, colours, view_of
 
 MOST = 256 * 64 * 1024  # maximum pixels of all images of a page: about 33 MB
@@ -41,6 +42,14 @@ class Panel(NamedTuple):
     rays: Tensor  # elevation and azimuth in radians, (2, H, W)
     labels: ndarray | None = None  # semantic ids, (T, H, W)
     frames: Sequence[str] = ()  # slider captions
+
+
+def panel_of(caption: str, images: ndarray, rays: Tensor, frames: Sequence[str] = ()) -> Panel:
+    """The panel of a model's images, (T, C, H, W): their third channel are labels, if there is
+    one.
+    """
+    labels = semantic_ids(images[:, 2]) if images.shape[1] > 2 else None
+    return Panel(caption, images[:, :2], rays, labels, frames)
 
 
 def page(panels: Sequence[Panel], title: str = "r2flow") -> str:

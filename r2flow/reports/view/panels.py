@@ -26,7 +26,7 @@ from r2flow.lidar.labels import labels_beside
 from r2flow.lidar.scan_files import points_beside, read_range_image
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.reports.tables import short_names
-from r2flow.reports.view import Panel, write_viewer
+from r2flow.reports.view import Panel, panel_of, write_viewer
 from r2flow.simulator import simulate
 
 
@@ -140,12 +140,12 @@ def sample_panels(
     label = f"{label}, seed {seed}"
     if not steps:
         return [
-            Panel(f"{label}, sample {number}", image[None], rays)
+            panel_of(f"{label}, sample {number}", image[None], rays)
             for number, image in enumerate(drawn[0])
         ]
     frames = [f"sample {number}" for number in range(num)]
     return [
-        Panel(f"{label}, {count} step{'s' if count > 1 else ''}", images, rays, None, frames)
+        panel_of(f"{label}, {count} step{'s' if count > 1 else ''}", images, rays, frames)
         for count, images in zip(steps, drawn, strict=True)
     ]
 
