@@ -22,6 +22,7 @@ import torch
 import torch.nn.functional as F
 from numpy import ndarray
 from real import shared
+from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -316,6 +317,33 @@ def map_part(model: Checkpoint, ways: dict[str, Segment], num: int = 8) -> None:
     print_table(lines, ["scans", "mIoU of the map read back", "mean |log range error|"])
 
 
+def densified_part(model: Checkpoint, ways: dict[str, Segment], num: int = 8) -> None:
+    """Labels of the hidden rows of simulated scans of a VLP-16 with 64 rows, 16 of them known."""
+    sensor = SENSORS["vlp16"].resized(64, 1800)
+    truth = simulated("vlp16", num, 1800, seed=9, rows=64)
+    beams = np.array(SENSORS["vlp16"].elevations)
+    rows = np.abs(np.array(sensor.elevations)[:, None] - beams).min(1) < 1e-3
+    known = np.broadcast_to(rows[:, None], sensor.shape)
+    state = torch.from_numpy(np.where(known, np.where(truth[:, 0] > 0, 1, 2), 0))
+    given = torch.from_numpy(truth * known)
+    answers = complete(model.through(sensor), given, state)
+    steps = -np.diff(np.radians(sensor.elevations)).mean(), 2 * np.pi / 1800
+    found: dict[str, list[list[float]]] = {"labels known, densified": [], "nearest label": []}
+    for image, answer in zip(truth, answers, strict=True):
+        seen = known & (image[2] > 0)
+        nearest = distance_transform_edt(~seen, steps, return_distances=False, return_indices=True)
+        hidden = image[2] * ~known
+        both = hidden * (answer.images[0, 0].numpy() > 0)
+        ways_here = (answer.images[0, 2].numpy(), image[2][tuple(nearest)])
+        for values, classes in zip(found.values(), ways_here, strict=True):
+            values.append([mean_iou(confusion(true, classes)) for true in (hidden, both)])
+    lines = [
+        [name, *(f"{value:.3f}" for value in np.mean(values, axis=0))]
+        for name, values in found.items()
+    ]
+    print_table(lines, ["hidden rays of a VLP-16", "mIoU", "mIoU where the model returns"])
+
+
 def training_part(model: Checkpoint, ways: dict[str, Segment], num: int = 500) -> None:
     """Segmenters of 32 x 256 that learned from simulated, from generated scans, and from both.
 
@@ -348,10 +376,11 @@ def main() -> None:
         "real": real_part,
         "geometry": geometry_part,
         "maps": map_part,
+        "densified": densified_part,
         "training": training_part,
     }
     parser.add_argument("model", nargs="?", default="labels")
-    parser.add_argument("--parts", default="real,geometry,maps,training")
+    parser.add_argument("--parts", default="real,geometry,maps,densified,training")
     parser.add_argument("--seconds", type=float, default=600, help="of the segmenter's training")
     parser.add_argument("--scenes", type=int, default=600, help="simulated scans of each sensor")
     parser.add_argument("--keep", type=Path, help="file of the segmenter; read, if it is there")

@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from r2flow.generators.base import IMAGE, KNOWN, Condition
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.lidar.labels import COMMON
 
 FEATURES = 31  # of `Surroundings`
 ROW = 8  # size of the vector learned for each row
@@ -99,8 +98,11 @@ class Surroundings(NamedTuple):
             guess / 3 - 1,
         ]
         start = torch.where(measured > 0, image[:, : start.shape[1]], start)
-        even = 2 / len(COMMON) - 1  # all classes are equally likely
-        start = torch.cat([start, torch.where(labelled > 0, image[:, planes], even)], 1)
+        if space.encoding.labels:
+            angle = torch.hypot(down * steps[:, :1, None, None], across * steps[:, 1:, None, None])
+            share = near / angle.clamp(min=1e-6)
+            labels = _interpolated(image[:, planes], labelled, share, down, across)
+            start = torch.cat([start, labels], 1)
         sure = measured * torch.where(returned, 1, -1)
         together = torch.cat(features, 1)
         return cls(together, ranges, strengths, present, guess, start, labelled, sure)
@@ -194,12 +196,26 @@ def first_present(values: Tensor, present: Tensor, order: Sequence[int], default
 
 
 def _moved(values: Tensor, down: Tensor, across: Tensor) -> Tensor:
-    """Values of images (2, B, 1, H, W) at offsets in rows and columns, (2, B, N, H, W)."""
+    """Values of images (C, B, 1, H, W) at offsets in rows and columns, (C, B, N, H, W)."""
     rows, columns = values.shape[3:]
     row = torch.arange(rows, device=values.device)[:, None] + down.long()
     column = (torch.arange(columns, device=values.device) + across.long()) % columns
-    pixel = (row * columns + column).flatten(1).expand(2, -1, -1)
-    return values.flatten(2).gather(2, pixel).view(2, *down.shape)
+    pixel = (row * columns + column).flatten(1).expand(len(values), -1, -1)
+    return values.flatten(2).gather(2, pixel).view(len(values), *down.shape)
+
+
+def _interpolated(
+    planes: Tensor, known: Tensor, share: Tensor, down: Tensor, across: Tensor
+) -> Tensor:
+    """Planes of labels, (B, K, H, W): where not known 2 p - 1, with the shares p of the classes
+    among the nearest returns, (B, 4, H, W); all are equally likely where these have no label.
+    """
+    classes = torch.arange(1, planes.shape[1] + 1, device=planes.device)
+    numbers = _moved(((planes.argmax(1, keepdim=True) + 1) * known)[None], down, across)[0]
+    p = torch.stack([(share * (numbers == number)).sum(1) for number in classes], 1)
+    total = p.sum(1, keepdim=True)
+    p = torch.where(total > 0, p / total.clamp(min=1e-12), 1 / len(classes))
+    return torch.where(known > 0, planes, 2 * p - 1)
 
 
 def _between(log_r: Tensor, strength: Tensor, distance: Tensor) -> Tensor:

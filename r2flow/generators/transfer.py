@@ -42,6 +42,7 @@ _CANDIDATES = 7  # six of `Surroundings` and one predicted freely by the network
 # log r per unit of network output: of the free candidate, of a neighbour.
 _FREE = 0.3
 _SHIFT = 0.02
+_OTHER = 0.02  # share of a class that the nearest returns have not, before the network speaks
 # Share of the correction of reflectance for other sensors: best on three real scans.
 _FOREIGN = 0.5
 # Other sensors: low rays are not lost as those that the training sensor's own car hides.
@@ -167,7 +168,10 @@ class TransferFlow(Flow):
         if not self.training:
             strengths = strengths.clamp(0, 1)
         sure = torch.where(about.sure != 0, -NEVER * about.sure, output[:, -2:-1] + 1)
-        return Answers(logits, ranges, scales, sure, strengths, labels.log_softmax(1))
+        # So are the labels of the nearest returns.
+        copied = (about.start[:, returns:] + 1) / 2 + _OTHER
+        labels = (labels + copied.log()).log_softmax(1)
+        return Answers(logits, ranges, scales, sure, strengths, labels)
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         return self.mean_velocity(t, x, torch.zeros(()), condition)
