@@ -193,9 +193,12 @@ def _draw_labels(axes: Any, labels: np.ndarray) -> None:
     legend = [Patch(color=value, label=name) for name, value in classes.values()]
     axes.legend(
         handles=legend,
-        loc="lower left",
-        bbox_to_anchor=(1.0, -0.1),
-        fontsize=4,
+        loc="upper left",
+        bbox_to_anchor=(0, 0),
+        borderpad=0,
+        ncols=len(legend),
+        columnspacing=1.2,
+        fontsize=4.5,
         frameon=False,
         handlelength=1,
     )
