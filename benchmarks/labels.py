@@ -347,7 +347,7 @@ def densified_part(model: Checkpoint, ways: dict[str, Segment], num: int = 8) ->
 def training_part(model: Checkpoint, ways: dict[str, Segment], num: int = 500) -> None:
     """Segmenters of 32 x 256 that learned from simulated, from generated scans, and from both.
 
-    Each has three seeds and 90 processor seconds. Written down before: generated scans help if
+    Each has three seeds and 60 processor seconds. Written down before: generated scans help if
     `both` is ahead of `simulated` in all three seeds of both sets of real scans.
     """
     street = load_checkpoint("street")
@@ -361,7 +361,7 @@ def training_part(model: Checkpoint, ways: dict[str, Segment], num: int = 500) -
     for kind, sets in kinds.items():
         found: dict[str, list[str]] = {}
         for seed in range(3):
-            network = trained([(images, own) for images in sets], 90, seed, channels=24)
+            network = trained([(images, own) for images in sets], 60, seed, channels=24)
             for cells, _ in rows({kind: by_network(network)}, real):
                 found.setdefault(cells[0], []).append(cells[2].split()[0])
         lines += [[kind, name, *ious] for name, ious in found.items()]

@@ -9,7 +9,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
-RESULTS = {"results.md", "street.md", "densify.md", "CHANGELOG.md"}  # where measurements belong
+RESULTS = {
+    "results.md",
+    "street.md",
+    "densify.md",
+    "labels.md",
+    "CHANGELOG.md",
+}  # where measurements belong
 # of a sentence; characters of a row of a table and of another line
 WORDS, TABLE, LINE = 30, 120, 200
 DATE = re.compile(r"\b20\d\d-\d\d-\d\d\b|\bseeds? \d")

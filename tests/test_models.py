@@ -78,7 +78,7 @@ def test_densify_is_ahead_of_interpolation(
 def test_the_wheel_can_bear_the_models():
     files = list(find_model("street").parent.glob("*.safetensors"))
     assert {path.stem for path in files} == set(MODELS)
-    assert sum(path.stat().st_size for path in files) <= 20e6
+    assert sum(path.stat().st_size for path in files) <= 21e6
 
 
 def test_two_lines_of_python_without_a_network_and_a_light_import():

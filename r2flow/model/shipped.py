@@ -31,6 +31,10 @@ MODELS: Registry[Model] = Registry(
         "scans of few beams or points completed to all, learned from simulated scans",
         "3bf412e171f7e822f6411250b090af8a920d20b00c1a5f86f6d61eb62a213712",
     ),
+    labels=Model(
+        "labels of scans, scans of labels and denser scans with both, from simulated scans",
+        "3c173b5af27dc25516fdc24240cb4ea92533371668b6ba3013ea1404c13f126d",
+    ),
 )
 DEFAULT = "street"
 DENSIFY = "densify"
