@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -198,6 +199,21 @@ class TestSets:
             tmp_path / "a.pcd.bin"
         )
         assert open_scans(str(tmp_path), READING).source.names == ["a.pcd.bin"]
+
+    @pytest.mark.parametrize("places", [("", ""), ("velodyne", "labels")])
+    def test_labels_beside_generated_scans_change_nothing(self, real, tmp_path, places):
+        """SPIRAL's samples: `.bin` of x y z reflectance, `.label` of a uint32 a point."""
+        plain = folder(tmp_path / "plain", images(10, 2))
+        scans, labels = (tmp_path / "labelled" / place for place in places)
+        shutil.copytree(plain, scans)
+        labels.mkdir(exist_ok=True)
+        for path in scans.glob("*.bin"):
+            points = path.stat().st_size // 16
+            np.arange(points, dtype=np.uint32).tofile(labels / f"{path.stem}.label")
+        both = [open_scans(str(each), READING) for each in (plain, tmp_path / "labelled")]
+        assert [len(one) for one in both] == [10, 10]
+        truth = open_scans(str(real), READING)
+        assert figures(truth, both[0]) == figures(truth, both[1])
 
     def test_scans_are_read_as_all_parts_of_a_mixture_were(self):
         parts = [

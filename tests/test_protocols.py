@@ -67,6 +67,17 @@ def distance(a: np.ndarray, b: np.ndarray) -> float:
     return math.sqrt(entropy[2] - (entropy[0] + entropy[1]) / 2)
 
 
+def discrepancy(a: list[np.ndarray], b: list[np.ndarray]) -> float:
+    """Biased MMD of histograms that sum to 1, exp(-|p - q|^2 / (2 * 0.5^2))."""
+    p, q = (np.stack([from_above([xyz]).ravel() for xyz in each]) for each in (a, b))
+    p, q = (each / each.sum(1, keepdims=True) for each in (p, q))
+
+    def mean(x: np.ndarray, y: np.ndarray) -> float:
+        return np.exp(-2 * ((x[:, None] - y) ** 2).sum(2)).mean()
+
+    return mean(p, p) + mean(q, q) - 2 * mean(p, q)
+
+
 @pytest.fixture
 def measured(tmp_path: Path) -> tuple[Path, list[np.ndarray]]:
     draw, clouds = np.random.default_rng(5), []
@@ -89,9 +100,13 @@ def figure(real: Path, judged: Path, rules, metric: str = "jsd") -> float:
 
 def test_real_points_are_the_measured_ones_and_generated_ones_bin_corners(measured, generated):
     made = images(10, 2)[:, 0].astype(np.float64)
-    corners = from_above([on_corners(r) for r in images(10, 2)[:, 0]])
+    corner_clouds = [on_corners(r) for r in images(10, 2)[:, 0]]
+    corners = from_above(corner_clouds)
     found = figure(measured[0], generated, PAPER)
     assert found == pytest.approx(distance(from_above(measured[1]), corners), rel=1e-5)
+    assert figure(measured[0], generated, PAPER, "mmd") == pytest.approx(
+        discrepancy(measured[1], corner_clouds), rel=1e-5
+    )
     centres = [
         from_above([points(r, *angles(0.5, 0.5)) for r in both])
         for both in (images(6, 1)[:, 0], made)

@@ -10,6 +10,8 @@ from torch import Tensor
 NEVER = -1e4  # logit of a missing candidate
 # Correlation length of drawn answers: best panel on scans of KITTI raw and object.
 TOGETHER = math.radians(1.5)
+HIT = 0.1  # metres
+FAINT = 0.1  # reflectance of training, below which differences are as errors, not as ratios
 
 
 @dataclass(frozen=True)
@@ -22,10 +24,25 @@ class Answers:
     returns: Tensor  # logit of a return, (B, 1, H, W)
     strengths: Tensor  # reflectance of each candidate, (B, 7, H, W)
     labels: Tensor  # log probability of each class, given a return, (B, K, H, W); K = 0 without
+    faint: Tensor | float = FAINT  # `FAINT` in the scan's own units
 
     def log_density(self, log_r: Tensor) -> Tensor:
         """log p(log r | return), (B, 1, H, W)."""
         return self._log_densities(log_r).logsumexp(1, keepdim=True)
+
+    def strength(self) -> Tensor:
+        """Reflectance, (B, 1, H, W): the mean of log(s + faint) over candidates, weights sqrt(p).
+
+        A retroreflector hardly brightens what is next to it. Neighbours agree in reflectance over
+        more than an edge in range, so the likeliest candidate counts less than for range.
+        """
+        weights = (self.logits / 2).softmax(1)
+        mean = ((self.strengths + self.faint).log() * weights).sum(1, keepdim=True)
+        return mean.exp() - self.faint
+
+    def hits(self, log_r: Tensor) -> Tensor:
+        """Probability, given a return, that r is within `HIT` of a range, (B, 1, H, W)."""
+        return (2 * HIT * (self.log_density(log_r) - log_r).exp()).clamp(max=1)
 
     def likeliest(self, log_r: Tensor) -> Tensor:
         """Index of the candidate most likely to have produced log r, (B, 1, H, W)."""

@@ -32,7 +32,7 @@ class Surroundings(NamedTuple):
 
     features: Tensor  # (B, `FEATURES`, H, W); all but one are invariant to scaling all ranges
     ranges: Tensor  # log r of the candidates, (B, 6, H, W)
-    strengths: Tensor  # reflectance of the candidates, (B, 6, H, W); 0 for a model of range alone
+    strengths: Tensor  # reflectance times gain, (B, 6, H, W); 0 for a model of range alone
     there: Tensor  # which candidates exist, (B, 6, H, W) bool
     guess: Tensor  # log r of the best candidate, (B, 1, H, W)
     start: Tensor  # measured rays, else the best candidate, in model space, (B, C, H, W)
@@ -41,13 +41,19 @@ class Surroundings(NamedTuple):
 
     @classmethod
     def of(
-        cls, space: ModelSpace, condition: Condition, ring: bool, steps: Tensor
+        cls,
+        space: ModelSpace,
+        condition: Condition,
+        ring: bool,
+        steps: Tensor,
+        gain: Tensor | float = 1.0,
     ) -> "Surroundings":
         """Candidates and features from a condition (`condition_of`).
 
         Args:
             ring: Whether the columns are a full turn.
             steps: Angles between rows and between columns in radians, (B, 2).
+            gain: Factor of reflectance; features above 1 are clipped, candidates are not.
         """
         image = condition[IMAGE].float()
         known = condition[KNOWN].float()
@@ -58,7 +64,7 @@ class Surroundings(NamedTuple):
         loud = known[:, channels.get("reflectance", channels["range"])]
         strength = torch.zeros_like(r)
         if space.encoding.reflectance:
-            strength = metres[:, 1:2] * loud
+            strength = metres[:, 1:2] * loud * gain
         planes = channels.get("label", slice(0, 0))
         labelled = known[:, planes][:, :1]
         returned = r > 0
@@ -79,12 +85,12 @@ class Surroundings(NamedTuple):
         guess, mean = first_present(both, present, (4, 5, 0, 1, 2, 3), nothing)
         ranges, strengths = both
         metres = guess.exp().clamp(space.sensor.min_range, space.sensor.max_range)
-        start = encoded(space, metres, mean)
+        start = encoded(space, metres, mean / gain)
         relative = ((ranges - guess) * present).clamp(-3, 3)
         features = [
             near,
             relative[:, :4],
-            strengths[:, :4],
+            strengths[:, :4].clamp(max=1),
             down.asinh() / 2,
             across.asinh() / 2,
             present[:, 4:],
@@ -93,7 +99,7 @@ class Surroundings(NamedTuple):
             returned,
             loud,
             ((log_r - guess) * returned).clamp(-3, 3),
-            strength,
+            strength.clamp(max=1),
             ~any_present,
             guess / 3 - 1,
         ]
@@ -183,6 +189,12 @@ def within_reach(known: Tensor) -> Tensor:
             gap = measured.diff(dim=0).amax() if len(measured) > 1 else len(rows)
             rows.copy_((number > measured[0] - gap) & (number < measured[-1] + gap))
     return reach[:, None, :, None]
+
+
+def every_second(known: Tensor) -> Tensor:
+    """The second, fourth, ... of the measured rows, (B, 1, H, 1), of (B, 1, H, W)."""
+    measured = known.any(3, keepdim=True)
+    return measured & (measured.cumsum(2) % 2 == 0)
 
 
 def first_present(values: Tensor, present: Tensor, order: Sequence[int], default: Tensor) -> Tensor:

@@ -17,8 +17,8 @@ from r2flow.base.registry import NonNegative
 from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.path import expand_time
 from r2flow.flow.solvers.solution import wide
-from r2flow.generators.answers import NEVER, Answers, smoothed
-from r2flow.generators.base import IMAGE, KNOWN, Condition, Generated, Generator
+from r2flow.generators.answers import FAINT, NEVER, Answers, smoothed
+from r2flow.generators.base import IMAGE, KNOWN, Condition, Generated, Generator, autocast
 from r2flow.generators.flow import Conditioned, Flow
 from r2flow.generators.surroundings import (
     FEATURES,
@@ -27,9 +27,9 @@ from r2flow.generators.surroundings import (
     RowFeatures,
     Surroundings,
     encoded,
+    every_second,
     first_present,
     gain_of,
-    scaled,
     steps_of,
     within_reach,
 )
@@ -39,12 +39,14 @@ from r2flow.samplers import Jump
 
 _LAST = 1e-5  # smallest 1 - t that the velocity is divided by
 _CANDIDATES = 7  # six of `Surroundings` and one predicted freely by the network
+_RETURN = 3 * _CANDIDATES  # output of the network: logit of a return
+_STRENGTH = slice(_RETURN + 1, _RETURN + 2)  # and the correction of reflectance
 # log r per unit of network output: of the free candidate, of a neighbour.
 _FREE = 0.3
 _SHIFT = 0.02
 _OTHER = 0.02  # share of a class that the nearest returns have not, before the network speaks
-# Share of the correction of reflectance for other sensors: best on three real scans.
-_FOREIGN = 0.5
+# Other sensors: what a return in the wrong place costs, as a share of one where there is none.
+_MISPLACED = 0.5
 # Other sensors: low rays are not lost as those that the training sensor's own car hides.
 _RAISED = math.radians(3)
 WEIGHTS = {"range": 1.0, "return": 2.0, "reflectance": 4.0, "label": 1.0}  # loss weights
@@ -131,14 +133,34 @@ class TransferFlow(Flow):
         part.foreign = self.foreign or other or not numbered
         return part
 
-    def answers(self, t: Tensor, x: Tensor, about: Surroundings, rows: Tensor) -> Answers:
+    def answers(
+        self,
+        t: Tensor,
+        x: Tensor,
+        about: Surroundings,
+        rows: Tensor,
+        gain: Tensor | float = 1.0,
+        share: Tensor | float = 1.0,
+    ) -> Answers:
         """p(x_1 | x_t, condition) at times t, (B,) or (), with x = x_t, (B, C, H, W).
 
-        `rows` are of `RowFeatures`.
+        Args:
+            rows: The output of `RowFeatures`.
+            gain: That of the `Surroundings`.
+            share: Share of the learned correction of reflectance.
         """
+        inputs = self._inputs(x, about, rows)
+        output = self.backbone(t, inputs).float()
+        if self.foreign:
+            elevation = x.shape[1] - self.classes + FEATURES + ROW
+            inputs[:, elevation] += STEEP * _RAISED
+            output[:, _RETURN] = self.backbone(t, inputs).float()[:, _RETURN]
+        return self._read(output, about, gain, share)
+
+    def _inputs(self, x: Tensor, about: Surroundings, rows: Tensor) -> Tensor:
         rows = rows.expand(len(x), -1, *x.shape[2:])
         returns = x.shape[1] - self.classes  # channels of range and reflectance
-        inputs = torch.cat(
+        return torch.cat(
             [
                 (x - about.start)[:, :returns],
                 about.features,
@@ -148,13 +170,13 @@ class TransferFlow(Flow):
             ],
             1,
         )
-        output = self.backbone(t, inputs).float()
+
+    def _read(
+        self, output: Tensor, about: Surroundings, gain: Tensor | float, share: Tensor | float
+    ) -> Answers:
+        """The answers in an output of the network."""
+        correction = share * output[:, _STRENGTH]
         output, labels = output.tensor_split([3 * _CANDIDATES + 2], 1)
-        correction = output[:, -1:]
-        if self.foreign:
-            inputs[:, returns + FEATURES + ROW] += STEEP * _RAISED  # the elevation
-            output[:, -2] = self.backbone(t, inputs).float()[:, 3 * _CANDIDATES]
-            correction = correction * _FOREIGN
         logits, shifts, scales = output[:, :-2].chunk(3, 1)
         # The interpolations are likelier at first.
         logits = logits + logits.new_tensor([0, 0, 0, 0, 2, 1, 0])[:, None, None]
@@ -164,14 +186,15 @@ class TransferFlow(Flow):
         ranges = torch.cat([near, about.guess + _FREE * shifts[:, 6:]], 1)
         scales = (scales - 4).clamp(max=2).exp() + 1e-3
         nearest = first_present(about.strengths, about.there, range(4), about.strengths[:, :1])
-        strengths = torch.cat([about.strengths, nearest], 1) + correction
+        strengths = (torch.cat([about.strengths, nearest], 1) + correction) / gain
         if not self.training:
             strengths = strengths.clamp(0, 1)
         sure = torch.where(about.sure != 0, -NEVER * about.sure, output[:, -2:-1] + 1)
         # So are the labels of the nearest returns.
-        copied = (about.start[:, returns:] + 1) / 2 + _OTHER
+        classes = about.start.shape[1] - self.classes
+        copied = (about.start[:, classes:] + 1) / 2 + _OTHER
         labels = (labels + copied.log()).log_softmax(1)
-        return Answers(logits, ranges, scales, sure, strengths, labels)
+        return Answers(logits, ranges, scales, sure, strengths, labels, FAINT / gain)
 
     def velocity(self, t: Tensor, x: Tensor, condition: Condition | None = None) -> Tensor:
         return self.mean_velocity(t, x, torch.zeros(()), condition)
@@ -212,13 +235,41 @@ class TransferFlow(Flow):
 
     def _answered(self, t: Tensor, x: Tensor, condition: Condition) -> Answers:
         about = Surroundings(*(condition[name] for name in Surroundings._fields))
-        return self.answers(t, x.float(), about, condition["rows"])
+        how = (condition[name] for name in ("rows", "gain", "share"))
+        return self.answers(t, x.float(), about, *how)
+
+    def _share(self, condition: Condition, noise: Tensor, steps: Tensor) -> Tensor:
+        """Share of the learned correction of reflectance that suits each scan, (B, 1, 1, 1).
+
+        Some sensors are unlike those of training. Of the measured rows every second is hidden, in a
+        quarter of the columns: the share has the least error there. It is 1 if that tells nothing.
+        """
+        columns = noise.shape[3]
+        front = slice(3 * columns // 8, 5 * columns // 8 + 1)
+        image, known, noise = (x[..., front] for x in (condition[IMAGE], condition[KNOWN], noise))
+        gain = condition["gain"]
+        hidden = every_second(known[:, :1])
+        kept = known * ~hidden
+        about = Surroundings.of(self.space, {IMAGE: image, KNOWN: kept}, False, steps, gain)
+        inputs = self._inputs(about.start + (kept < 1) * noise, about, condition["rows"])
+        output = self.backbone(torch.zeros((), device=noise.device), inputs).float()
+        metres = self.space.decode(image)
+        told = hidden & (known[:, 1:2] > 0) & (metres[:, :1] > 0)
+        error = metres[:, 1:2] - self._read(output, about, gain, 0.0).strength()
+        correction = output[:, _STRENGTH] / gain
+        shares = torch.linspace(1, 0, 11, device=noise.device)
+        errors = [(told * (error - share * correction).abs()).sum((1, 2, 3)) for share in shares]
+        return shares[torch.stack(errors).argmin(0)][:, None, None, None]
 
     def _chosen(self, answers: Answers) -> Tensor:
-        r = self._within(answers.ranges.gather(1, answers.least_error()))
-        strength = (answers.logits.exp() * answers.strengths).sum(1, keepdim=True)
+        log_r = answers.ranges.gather(1, answers.least_error())
         returned = answers.returns > 0
-        x_1 = encoded(self.space, r * returned, strength * returned)
+        if self.foreign:
+            # Least expected cost: 1 of a wrong ray-drop, less of a return in the wrong place.
+            misplaced = _MISPLACED * (1 - answers.hits(log_r))
+            returned = answers.returns.sigmoid() * (2 - misplaced) > 1
+        strength = answers.strength()
+        x_1 = encoded(self.space, self._within(log_r) * returned, strength * returned)
         return _labelled(x_1, answers, returned)
 
     def _mean(self, answers: Answers) -> Tensor:
@@ -249,26 +300,29 @@ class TransferFlow(Flow):
         weight = wide(next(self.parameters()))
         image = condition[IMAGE].to(weight)
         known = condition[KNOWN].to(weight)
-        scan = image
-        # Another sensor's intensities have another scale than those that the network has seen.
-        gain = None
+        measured = {IMAGE: image, KNOWN: known}
+        gain = torch.ones_like(image[:, :1, :1, :1])
         if self.space.encoding.reflectance and self.foreign:
+            # Its intensities have another scale than those that the network has seen.
             gain = gain_of(self.space, image, known)
-            scan = scaled(image, gain)
-        measured = {IMAGE: scan, KNOWN: known}
         elevations = self.elevations.to(weight)[None].expand(len(image), -1)
         steps = steps_of(elevations, 2 * math.pi / image.shape[3])
-        about = Surroundings.of(self.space, measured, True, steps)
+        about = Surroundings.of(self.space, measured, True, steps, gain)
         numbered = torch.tensor(self.numbered, device=weight.device).expand(len(image))
         measured["rows"] = self.rows(elevations, steps, numbered)
-        start = about.start + self.sigma * (known < 1) * noise.to(weight)
+        noise = self.sigma * noise.to(weight)
+        measured |= {"gain": gain, "share": torch.ones_like(gain)}
+        tested = bool((gain != 1).any())
+        if tested:
+            with autocast(self.device, how.get("precision", "32-true")):
+                measured["share"] = self._share(measured, noise, steps)
+        start = about.start + (known < 1) * noise
         generated = super().forward(start, {**measured, **about._asdict()}, **how)
         x = generated.x.to(image)
-        if gain is not None:
-            x = scaled(x, 1 / gain)
         x = torch.where(within_reach(known.amax(1, True)), x, self._empty(image[:, :1]))
         x = torch.where(known > 0, image, x)
-        evaluations = generated.evaluations * (2 if self.foreign else 1)  # see `answers`
+        # See `answers` and `_share`.
+        evaluations = generated.evaluations * (2 if self.foreign else 1) + tested
         return replace(generated, x=x, evaluations=evaluations)
 
     def loss(

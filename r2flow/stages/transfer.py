@@ -13,8 +13,8 @@ from r2flow.base.registry import Count, Portion, construct
 from r2flow.data.loader import ItemFormat
 from r2flow.generators import Generator, TransferFlow
 from r2flow.generators.base import IMAGE, KNOWN
-from r2flow.generators.surroundings import steps_of
-from r2flow.generators.transfer import WEIGHTS, gain_of, scaled
+from r2flow.generators.surroundings import gain_of, scaled, steps_of
+from r2flow.generators.transfer import WEIGHTS
 from r2flow.lidar.encoding import ModelSpace
 from r2flow.lidar.known import Ray, every_row, random_points, random_rows
 from r2flow.lidar.sensors import Sensor

@@ -1,6 +1,7 @@
 """Damaged scan files give one line with the file's name, or finite points."""
 
 import os
+import pickle
 import re
 import struct
 import time
@@ -280,6 +281,13 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_headers_and_rows_are_refused(tmp_path, case):
     assert read_bytes(tmp_path, *WRONG[case]) is None
+
+
+def test_a_list_of_scans_pickled_as_a_pcd_is_not_read_and_its_cure_named(tmp_path):
+    with (tmp_path / "samples.pcd").open("wb") as file:
+        pickle.dump([np.zeros((4, 3), np.float32)], file)
+    with pytest.raises(InputError, match=r"is a pickle.*joblib\.load"):
+        read_points(tmp_path / "samples.pcd")
 
 
 def test_paths_that_are_not_regular_files_are_refused(tmp_path):

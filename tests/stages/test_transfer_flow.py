@@ -132,6 +132,38 @@ def test_the_intensities_of_another_sensor_may_have_any_scale(flow, scans):
     counted.remove()
 
 
+@pytest.mark.parametrize("useful", [1.0, 0.3, 0.0])
+def test_the_correction_of_reflectance_is_tried_on_measured_rows(useful, monkeypatch):
+    """The network adds 0.2 / gain. Of the measured rows every second has `useful` of it."""
+    flow = built(nought=True)
+    torch.nn.init.constant_(flow.backbone.answer.bias[-1:], 0.2)
+    flow = flow.at(flow.space.through(build_sensor("vlp16", 8, 32)))
+    images = torch.stack([torch.full((1, 8, 32), 9.0), torch.full((1, 8, 32), 0.3)], 1)
+    # v = 0.3 + useful * 0.2 / gain, and gain = 0.265 / ((0.3 + v) / 2)
+    k = useful * 0.1 / surroundings._REFLECTANCE
+    images[:, 1, 2::4] *= (1 + k) / (1 - k)
+    shares = []
+    given = flow.answers
+    monkeypatch.setattr(flow, "answers", lambda *args: shares.append(args[-1]) or given(*args))
+    answered(flow, images, measured(images, "rows:2"))
+    assert [share.item() for share in shares] == [pytest.approx(useful)]
+    answered(flow, images[:, :1], measured(images, "rows:2"))
+    assert shares[1].item() == 1  # nothing to try it on
+
+
+def test_bright_returns_of_another_sensor_are_not_cut_off(flow):
+    """Only the network's inputs are limited, to 1 by the gain."""
+    flow = copy.deepcopy(flow)
+    torch.nn.init.constant_(flow.backbone.answer.bias[-2:-1], 9.0)  # all return
+    other = flow.at(flow.space.through(build_sensor("vlp16", 8, 32)))
+    images = torch.stack([torch.full((1, 8, 32), 9.0), torch.full((1, 8, 32), 0.02)], 1)
+    images[:, 1, :, :4] = 0.9
+    state = ray_states(images, torch.ones(8, 32, dtype=torch.bool))
+    state[:, 1:4, :4] = Ray.UNKNOWN
+    made = other.space.decode(answered(other, images * (state > 0)[:, None], state).x)
+    assert made[0, 1, 1:4, 1].mean() > 0.6
+
+
 def test_the_returns_of_another_sensor_are_those_of_higher_rows(flow, scans):
     other, state = copy.copy(flow), condition_of(flow.space, scans, measured(scans))
     other.foreign, steps = True, torch.full((3, 2), 0.01)
@@ -184,14 +216,31 @@ def answers() -> Answers:
     return Answers(logits.log_softmax(1), ranges, scales, nothing[:, :1], nothing, nothing[:, :0])
 
 
-def test_reflectance_is_the_mean_over_the_candidates(flow):
-    p = torch.tensor([0.25, 0.75, 0, 0, 0, 0, 0])[None, :, None, None]
+def test_reflectance_is_a_mean_of_logarithms_by_the_roots_of_the_probabilities(flow):
+    p = torch.tensor([0.2, 0.8, 0, 0, 0, 0, 0])[None, :, None, None]
     strengths = torch.linspace(0.1, 0.7, 7)[None, :, None, None]
     returns = torch.ones(1, 1, 1, 1)
     logits = p.clamp(min=1e-30).log()
     sure = Answers(logits, 2 + 0 * p, 0 * p + 0.1, returns, strengths, p[:, :0])
     made = flow.space.decode(flow._chosen(sure))[0, :, 0, 0]
-    torch.testing.assert_close(made, torch.tensor([math.exp(2), 0.25 * 0.1 + 0.75 * 0.2]))
+    # roots 1 : 2, and 0.1 + 0.1 added before the logarithm
+    expected = (0.2 * 0.3**2) ** (1 / 3) - 0.1
+    torch.testing.assert_close(made, torch.tensor([math.exp(2), expected]))
+
+
+@pytest.mark.parametrize("scale", [0.002, 0.02, 1.0])
+def test_a_return_of_another_sensor_must_be_the_likelier_the_less_its_range_is_known(flow, scale):
+    """Wrong ray-drop costs 1, a return more than 0.1 m off a half, within a Laplace density."""
+    nothing = torch.zeros(1, 7, 50, 1)
+    logits = torch.tensor([0.0, *[-1e4] * 6])[None, :, None, None].expand_as(nothing)
+    likely = torch.linspace(0.02, 0.98, 50)[None, None, :, None]
+    ranges = nothing + math.log(10)
+    scales = nothing + scale
+    answers = Answers(logits, ranges, scales, likely.logit(), nothing, nothing[:, :0])
+    off = 1 - min(2 * 0.1 / 10 / (2 * scale), 1)  # by the density at the range
+    other = flow.at(flow.space.through(build_sensor("vlp16", 50, 32)))
+    returned = other.space.decode(other._chosen(answers))[:, :1] > 0
+    assert torch.equal(returned, likely * off / 2 + (1 - likely) < likely)
 
 
 def integral(answers: Answers, end: float, weight=lambda x: 1.0) -> float:

@@ -27,12 +27,22 @@ PLY_CODES = {  # NumPy's codes of PLY's types
 Table = tuple[list[str] | None, list[ndarray]]  # names of the columns, or None; columns
 
 
+PICKLED = b"\x80"  # of protocol 2 and later
+UNPACK = (  # joblib's list of (N, 3) arrays, of which each becomes a file
+    "python -c \"import joblib, numpy; [numpy.save(f'{i:06}.npy', x) for i, x in "
+    "enumerate(joblib.load('samples.pcd'))]\", and give the folder."
+)
+
+
 def read_pcd(path: Path) -> Table:
     """All fields of a PCD of version 0.7, or older ones, whose fields may be called COLUMNS.
 
     VIEWPOINT is not applied: points are in the sensor's frame. A field of COUNT 0 stores nothing.
     """
-    text, body = _split_header(path.read_bytes())
+    data = path.read_bytes()
+    if data.startswith(PICKLED):
+        raise InputError(f"it is a pickle, as LiDM's samples.pcd. If you trust it: {UNPACK}")
+    text, body = _split_header(data)
     header = {line.split()[0]: line.split()[1:] for line in text.splitlines() if line.strip()}
     declared = header.get("FIELDS") or header["COLUMNS"]
     counts = map(int, header.get("COUNT", ["1"] * len(declared)))
