@@ -67,7 +67,7 @@ class Checkpoints(Checkpoint):
         self._saved = 0
         self._stop = False
 
-    def on_train_batch_end(self, trainer: L.Trainer, *given: Any) -> None:
+    def on_train_batch_end(self, trainer, *given):
         *_, batch_idx = given
         stepped = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
         stop = self._stop or trainer.should_stop  # after a whole step: no run can resume within one
@@ -76,7 +76,7 @@ class Checkpoints(Checkpoint):
         if stepped and trainer.global_step % self.every == 0:
             self.save(trainer)
 
-    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_train_epoch_end(self, trainer, pl_module):
         if trainer.should_stop or trainer.global_step >= trainer.estimated_stepping_batches:
             self.save(trainer)
 

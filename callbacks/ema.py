@@ -67,7 +67,7 @@ class EMA(WeightAveraging):
         self._copies = step_idx == self._end and before <= (self.warmup_steps or 0)
         return before == step_idx or self._copies
 
-    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+    def setup(self, trainer, pl_module, stage):
         self._device = trainer.strategy.root_device  # the module moves there later
         # As the strategy does later: the average has its type.
         trainer.precision_plugin.convert_module(pl_module)
@@ -76,7 +76,7 @@ class EMA(WeightAveraging):
             # At 0 the base class copies the weights, whatever the rule.
             self._average_model.n_averaged.fill_(1)
 
-    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_train_start(self, trainer, pl_module):
         self._end = trainer.estimated_stepping_batches - 1
         if self.warmup_steps is None:
             images = pl_module.hparams.get("warmup_images", 0)
@@ -109,7 +109,7 @@ class HalfLifeEMA(EMA):
         self.half_life = half_life
         self.rampup = rampup
 
-    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_train_start(self, trainer, pl_module):
         super().on_train_start(trainer, pl_module)
         self.batch_size: Any = pl_module.images_per_step
 

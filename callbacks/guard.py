@@ -51,9 +51,7 @@ class Guard(L.Callback):
         self._losses: list[Tensor] = []
         self._found: list[bool] = []  # whether the gradients are finite, per optimiser in this step
 
-    def on_before_backward(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, loss: Tensor
-    ) -> None:
+    def on_before_backward(self, trainer, pl_module, loss):
         value = loss.detach()
         self._losses.append(value)
         # A loss can overflow while its gradient is finite, and on one device only. x - x is 0 or
@@ -61,9 +59,7 @@ class Guard(L.Callback):
         # it to all of them.
         loss.register_hook(lambda gradient: gradient + (value - value))
 
-    def on_before_optimizer_step(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: Any
-    ) -> None:
+    def on_before_optimizer_step(self, trainer, pl_module, optimizer):
         parameters = [p for group in optimizer.param_groups for p in group["params"]]
         gradients = [p.grad for p in parameters if p.grad is not None]
         finite = bool(torch.isfinite(get_total_norm(gradients)))  # the only device synchronisation
@@ -73,7 +69,7 @@ class Guard(L.Callback):
                 parameter.grad = None  # AdamW skips it and keeps its averages
         self._found.append(finite)
 
-    def on_train_batch_end(self, *given: Any) -> None:
+    def on_train_batch_end(self, *given):
         if self._found:  # else the batch was accumulated
             if all(self._found):
                 self.in_a_row = 0
@@ -106,9 +102,7 @@ class Guard(L.Callback):
                 step, loss, self.in_a_row, self.skips,
             )  # fmt: skip
 
-    def on_save_checkpoint(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
-    ) -> None:
+    def on_save_checkpoint(self, trainer, pl_module, checkpoint):
         learned = [name for name, _ in pl_module.named_parameters()]
         for key in ("current_model_state", "state_dict"):
             state = checkpoint.get(key, {})

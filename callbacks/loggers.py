@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import lightning as L
 import numpy as np
 from lightning.pytorch.callbacks import LearningRateMonitor
 from lightning.pytorch.loggers import (
@@ -87,9 +86,7 @@ PICTURES: dict[type, Callable[[Any, str, np.ndarray, int], None]] = {
 class LearningRates(LearningRateMonitor):
     """Logs the learning rates of each optimiser step, and keeps the loggers' count of steps."""
 
-    def on_train_batch_start(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
         if batch_idx % trainer.accumulate_grad_batches == 0:
             # Lightning counts one step too many after a stop by `trainer.max_time` at the step of a
             # validation.

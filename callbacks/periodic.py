@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any
 
 import lightning as L
 import torch
@@ -32,16 +31,14 @@ class Periodic(L.Callback, ABC):
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Action of a subclass."""
 
-    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_train_start(self, trainer, pl_module):
         self._last = trainer.global_step  # a resumed run has already acted at this step
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, *given: Any
-    ) -> None:
+    def on_train_batch_end(self, trainer, pl_module, *given):
         if self.every and trainer.global_step % self.every == 0:
             self.on_train_end(trainer, pl_module)
 
-    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_train_end(self, trainer, pl_module):
         """Act at this step, unless it was done: with gradient accumulation a step spans several
         batches.
         """
@@ -86,7 +83,7 @@ class SamplePictures(Periodic):
         if self.every and generator.unconditional:
             self.sampler(generator)
 
-    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+    def setup(self, trainer, pl_module, stage):
         generator: Generator = pl_module.generator  # type: ignore[assignment]
         self.check(generator)
 

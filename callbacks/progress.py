@@ -1,9 +1,7 @@
 """Training progress, with losses, rate and remaining time."""
 
 import time
-from typing import Any
 
-import lightning as L
 from lightning.pytorch.callbacks import ProgressBar
 
 from r2flow.base.progress import Bar
@@ -26,7 +24,7 @@ class Progress(ProgressBar):
     def disable(self) -> None:
         self.is_enabled = False
 
-    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_train_start(self, trainer, pl_module):
         steps = trainer.estimated_stepping_batches
         self._total = int(steps) if steps < float("inf") else 0
         self._bar = Bar(
@@ -36,7 +34,7 @@ class Progress(ProgressBar):
         self._bar.start()
         self._bar.set(trainer.global_step)
 
-    def on_train_batch_end(self, trainer: L.Trainer, *given: Any) -> None:
+    def on_train_batch_end(self, trainer, *given):
         assert self._bar is not None
         if trainer.global_step == self._bar.tasks[0].completed:
             return  # within a step: the losses are those of a part of its batch
@@ -56,9 +54,9 @@ class Progress(ProgressBar):
             note = "  ".join(notes)
         self._bar.set(trainer.global_step, note)
 
-    def on_train_end(self, trainer: L.Trainer, *given: Any) -> None:
+    def on_train_end(self, trainer, *given):
         if self._bar is not None:
             self._bar.stop()
 
-    def on_exception(self, trainer: L.Trainer, *given: Any) -> None:
+    def on_exception(self, trainer, *given):
         self.on_train_end(trainer)

@@ -15,7 +15,7 @@ class ReflowPairs(L.Callback):
     They are drawn by the flow `pairs.of` of the DataModule, else by the stage's parent.
     """
 
-    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+    def setup(self, trainer, pl_module, stage):
         data = trainer.datamodule  # type: ignore[attr-defined]
         if not isinstance(data, ScanDataModule) or data.pairs is None:
             return

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 import lightning as L
 from lightning.fabric.plugins.environments import LightningEnvironment
@@ -83,20 +82,13 @@ class Stopping(L.Callback):
         if not self._training and not again:
             self._leave("stopped")
 
-    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_train_start(self, trainer, pl_module):
         self._training = True
         self.run_dir = Path(trainer.default_root_dir)
         with suppress(ValueError):  # only the main thread can set handlers
             install_handlers(self.on_signal, self.signals)
 
-    def on_train_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-    ) -> None:
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
         if (batch_idx + 1) % trainer.accumulate_grad_batches:
             return
         stopped = self.received is not None
@@ -120,10 +112,10 @@ class Stopping(L.Callback):
                 wait_for_launcher()
             self._leave(f"stopped at step {trainer.global_step}")
 
-    def on_train_end(self, *given: Any) -> None:
+    def on_train_end(self, *given):
         self._training = False
 
-    def on_exception(self, *given: Any) -> None:
+    def on_exception(self, *given):
         self._training = False
 
     def _leave(self, where: str) -> None:

@@ -75,17 +75,13 @@ class Clock(L.Callback):
         self.images = state["images"]
         self.memory = state["memory"]
 
-    def on_train_batch_start(
-        self, trainer: L.Trainer, module: L.LightningModule, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_start(self, trainer, module, batch, batch_idx):
         if not self.memory:
             self._hooks = saved_tensors_hooks(self._keep, lambda x: x)
             self._hooks.__enter__()
         self._begin = _now(module.device)
 
-    def on_before_backward(
-        self, trainer: L.Trainer, module: L.LightningModule, loss: Tensor
-    ) -> None:
+    def on_before_backward(self, trainer, module, loss):
         if self._hooks is not None:
             self._hooks.__exit__(None, None, None)
             self._hooks = None
@@ -93,9 +89,7 @@ class Clock(L.Callback):
             kept = sum(size for at, size in self._kept.items() if at not in weights)
             self.memory = kept + 4 * sum(weights.values())
 
-    def on_train_batch_end(
-        self, trainer: L.Trainer, module: L.LightningModule, outputs: Any, batch: Any, *_: Any
-    ) -> None:
+    def on_train_batch_end(self, trainer, module, outputs, batch, *_):
         self.seconds.append(_now(module.device) - self._begin)
         self.total += self.seconds[-1]
         self.images += len(batch["x_1"])
