@@ -4,7 +4,6 @@ many.
 
 import logging
 import math
-from collections.abc import Iterable
 from typing import Any, NoReturn
 
 import lightning as L
@@ -64,7 +63,7 @@ class Guard(L.Callback):
         gradients = [p.grad for p in parameters if p.grad is not None]
         finite = bool(torch.isfinite(get_total_norm(gradients)))  # the only device synchronisation
         if not finite:
-            self._skip(trainer, pl_module, first=all(self._found))
+            self._skip(trainer, first=all(self._found))
             for parameter in parameters:
                 parameter.grad = None  # AdamW skips it and keeps its averages
         self._found.append(finite)
@@ -76,7 +75,7 @@ class Guard(L.Callback):
             self._losses.clear()
             self._found.clear()
 
-    def _skip(self, trainer: L.Trainer, pl_module: L.LightningModule, first: bool) -> None:
+    def _skip(self, trainer: L.Trainer, first: bool) -> None:
         """Count a skipped step, once for all optimisers, and stop the run after too many."""
         scaler = getattr(trainer.precision_plugin, "scaler", None)
         scale = float(scaler.get_scale()) if scaler else 1.0
@@ -91,10 +90,9 @@ class Guard(L.Callback):
                 trainer,
                 f"stopped at step {step}: steps skipped in a row for a non-finite loss or "
                 f"gradient: {self.in_a_row}, {self.total} in the run. Loss {loss:g}, loss "
-                f"scale {scale:g} of {trainer.precision}; {describe_gradients(pl_module)}; "
-                f"{describe_batch(trainer)}. {last_good(trainer)} Look at these scans; try "
-                "trainer.precision=32-true or, in a run of another name, a lower "
-                "stage.learning_rate.",
+                f"scale {scale:g} of {trainer.precision}; {describe_batch(trainer)}. "
+                f"{last_good(trainer)} Look at these scans; try trainer.precision=32-true or, in "
+                "a run of another name, a lower stage.learning_rate.",
             )
         if trainer.is_global_zero and not overflow:
             log.warning(
@@ -106,13 +104,13 @@ class Guard(L.Callback):
         learned = [name for name, _ in pl_module.named_parameters()]
         for key in ("current_model_state", "state_dict"):
             state = checkpoint.get(key, {})
-            if broken := _not_finite((name, state[name]) for name in learned if name in state):
+            weights = [state[name] for name in learned if name in state]
+            if not torch.isfinite(get_total_norm(weights, math.inf)):
                 self._end(
                     trainer,
                     f"stopped at step {trainer.global_step}: the weights or their average are no "
-                    f"longer finite ({broken[0]} first, {len(broken)} of {len(learned)}), so no "
-                    f"checkpoint was written. {last_good(trainer)} Start under another name with "
-                    "a lower stage.learning_rate.",
+                    f"longer finite, so no checkpoint was written. {last_good(trainer)} Start "
+                    "under another name with a lower stage.learning_rate.",
                 )
 
     def _end(self, trainer: L.Trainer, message: str) -> NoReturn:
@@ -135,15 +133,6 @@ def last_good(trainer: L.Trainer) -> str:
     return f"The last good checkpoint is {newest}, from which the same command resumes."
 
 
-def describe_gradients(module: torch.nn.Module) -> str:
-    """Describe the first parameter, in the module's order, with a non-finite gradient."""
-    named = [(name, p.grad) for name, p in module.named_parameters() if p.grad is not None]
-    broken = _not_finite(named)
-    if not broken:
-        return "gradients finite"
-    return f"gradient of {broken[0]} non-finite first, {len(broken)} of {len(named)}"
-
-
 def describe_batch(trainer: L.Trainer) -> str:
     """Describe the images and scans of the current step, on all devices and in all accumulated
     batches.
@@ -155,12 +144,3 @@ def describe_batch(trainer: L.Trainer) -> str:
     images = range(trainer.global_step * size, (trainer.global_step + 1) * size)
     scans = ", ".join(str(sampler.order[k]) for k in images)
     return f"images k = {images[0]} to {images[-1]}, scans {scans}"
-
-
-def _not_finite(tensors: Iterable[tuple[str, Tensor]]) -> list[str]:
-    """Names of the tensors with a NaN or an infinity, with one device synchronisation."""
-    named = list(tensors)
-    if not named:
-        return []
-    finite = torch.stack([torch.isfinite(value).all() for _, value in named]).tolist()
-    return [name for (name, _), is_finite in zip(named, finite, strict=True) if not is_finite]

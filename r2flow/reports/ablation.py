@@ -44,7 +44,7 @@ PATHS = 8  # scans of the bend
 # Kinds of figures in the order of the table; those of `COSTS` are not judged. An untrained flow is
 # straight, too.
 JUDGED = ("distance", *LINES, "error of x_1")
-COSTS = ("bend", "parameters", "GMAC", "ms", "images/s", "memory", "seconds")
+COSTS = ("bend", "parameters", "GMAC", "ms", "images/s", "seconds")
 RULE = (
     "Mean ± standard error over the seeds. * the best of its row, = no difference from the best: "
     "the intervals of mean ± 2 standard errors overlap. "

@@ -13,14 +13,11 @@ from functools import cached_property
 from itertools import compress, product
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import lightning as L
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from torch import Tensor
-from torch.autograd.graph import saved_tensors_hooks
 
 from r2flow.base.config import override
 from r2flow.base.errors import InputError, naming
@@ -51,53 +48,32 @@ _DEFAULTS = (
 
 
 class Clock(L.Callback):
-    """Seconds and memory of training steps; checkpoints keep the seconds of the whole run.
+    """Seconds of training steps; checkpoints keep those of the whole run.
 
-    Seconds are those of the processor divided by the threads, which other programs do not change,
-    or on other devices those of the clock. Memory is that of a step whatever the device: weights,
-    gradients, the two moments of Adam, and what the backward pass keeps.
+    They are those of the processor divided by the threads, which other programs do not change, or
+    on other devices those of the clock.
     """
 
     def __init__(self) -> None:
         self.seconds: list[float] = []
         self.total = 0.0
         self.images = 0
-        self.memory = 0
-        self._kept: dict[int, int] = {}
-        self._hooks: saved_tensors_hooks | None = None
         self._begin = 0.0
 
-    def state_dict(self) -> dict[str, Any]:
-        return {"seconds": self.total, "images": self.images, "memory": self.memory}
+    def state_dict(self):
+        return {"seconds": self.total, "images": self.images}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state):
         self.total = state["seconds"]
         self.images = state["images"]
-        self.memory = state["memory"]
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx):
-        if not self.memory:
-            self._hooks = saved_tensors_hooks(self._keep, lambda x: x)
-            self._hooks.__enter__()
         self._begin = _now(module.device)
-
-    def on_before_backward(self, trainer, module, loss):
-        if self._hooks is not None:
-            self._hooks.__exit__(None, None, None)
-            self._hooks = None
-            weights = {p.untyped_storage().data_ptr(): p.nbytes for p in module.parameters()}
-            kept = sum(size for at, size in self._kept.items() if at not in weights)
-            self.memory = kept + 4 * sum(weights.values())
 
     def on_train_batch_end(self, trainer, module, outputs, batch, *_):
         self.seconds.append(_now(module.device) - self._begin)
         self.total += self.seconds[-1]
         self.images += len(batch["x_1"])
-
-    def _keep(self, x: Tensor) -> Tensor:
-        storage = x.untyped_storage()
-        self._kept[storage.data_ptr()] = storage.nbytes()
-        return x
 
 
 def _now(device: torch.device) -> float:
@@ -252,10 +228,9 @@ class Ablation:
 
 
 def training_cost(run: Path) -> dict[str, float]:
-    """Seconds, images a second and memory in MiB of a run's training, by its last checkpoint."""
+    """Seconds and images a second of a run's training, by its last checkpoint."""
     clock = read_checkpoint(find_checkpoint(run))["callbacks"]["Clock"]
     return {
         "images/s in training": clock["images"] / clock["seconds"],
         "seconds of training": clock["seconds"],
-        "memory of training, MiB": clock["memory"] / 2**20,
     }

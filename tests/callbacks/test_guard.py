@@ -126,7 +126,6 @@ def test_the_line_names_everything_needed_to_look_further(tmp_path):
     with refused(
         "stopped at step 2: steps skipped in a row for a non-finite loss or gradient: 1",
         "Loss nan",
-        "gradient of inner.weight non-finite first, 4 of 4",
         "loss scale 1 of 32-true",
         "images k = 4 to 7, scans " + ", ".join(map(str, order[4:8])),
         f"last good checkpoint is {tmp_path}/checkpoints/step-00000001.ckpt",
@@ -173,7 +172,7 @@ def test_broken_weights_are_never_written(tmp_path, averaged: bool):
         trainer.save_checkpoint(tmp_path / f"checkpoints/step-{trainer.global_step:08d}.ckpt")
 
     callbacks = [EMA(every=1)] * averaged + [Guard(), LambdaCallback(on_train_batch_end=spoil)]
-    stopped = "stopped at step 3: the weights or their average are no longer finite (inner.bias first, 1 of 4)"
+    stopped = "stopped at step 3: the weights or their average are no longer finite, so no"
     with refused(stopped, "step-00000002.ckpt, from which the same command resumes"):
         fit(Line(), batches(*[1.0] * 9), tmp_path, *callbacks)
     assert [p.name for p in checkpoints_of(tmp_path)] == [
