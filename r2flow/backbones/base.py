@@ -1,7 +1,6 @@
 """Base class of backbones: fields on images of one shape with stored rays, for one time or two."""
 
 import copy
-from collections.abc import Sequence
 from typing import Any, Literal, Self
 
 import torch
@@ -223,17 +222,3 @@ def _follow_loaded_rays(backbone: Backbone, _keys: Any) -> None:
 
 def _times(times: Tensor | float, x: Tensor) -> Tensor:
     return at_least_float32(torch.as_tensor(times, device=x.device)).reshape(-1)
-
-
-def integers(name: str, values: int | Sequence[int], count: int) -> tuple[int, ...]:
-    """`count` integers, from a list of this length or from a single integer.
-
-    Raises:
-        InputError: If there are none or others than `count`, or one is below 1.
-    """
-    result = (values,) * count if isinstance(values, int) else tuple(map(int, values))
-    if len(result) != count or min(result, default=0) < 1:
-        raise InputError(
-            f"{name} must be {count or 1} integers of at least 1, found {list(result)}."
-        )
-    return result

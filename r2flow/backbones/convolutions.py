@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.backbones.base import Backbone, integers
+from r2flow.backbones.base import Backbone
 from r2flow.backbones.encodings import ENCODINGS, RayEncoding, position_name
 from r2flow.backbones.layers import (
     ExactBuffers,
@@ -19,7 +19,8 @@ from r2flow.backbones.layers import (
     wrapped,
     zero_initialised,
 )
-from r2flow.base.registry import Bound, Count, Portion, Positive
+from r2flow.base.errors import InputError
+from r2flow.base.registry import Bound, Count, Counts, Portion, Positive
 
 TimeChannels = Annotated[int, Bound("even and at least 4", lambda n: n >= 4 and n % 2 == 0)]
 
@@ -216,8 +217,8 @@ class UNet(Backbone, ABC):
         self,
         rays: Tensor,
         base_channels: TimeChannels = 64,
-        channel_multiplier: Sequence[int] = (1, 2, 4, 8),
-        num_residual_blocks: int | Sequence[int] = (3, 3, 3, 3),
+        channel_multiplier: Counts = (1, 2, 4, 8),
+        num_residual_blocks: Count | Counts = (3, 3, 3, 3),
         num_heads: Count = 8,
         time_channels: Count | None = None,
         position: str | None = "fourier_features",
@@ -228,8 +229,14 @@ class UNet(Backbone, ABC):
         **common: Any,
     ) -> None:
         levels = len(channel_multiplier)
-        multipliers = integers("channel_multiplier", channel_multiplier, levels)
-        counts = integers("num_residual_blocks", num_residual_blocks, levels)
+        counts = num_residual_blocks
+        if isinstance(counts, int):
+            counts = [counts] * levels
+        if len(counts) != levels:
+            raise InputError(
+                f"num_residual_blocks must be of {levels} levels, as channel_multiplier, found "
+                f"{counts}."
+            )
         unit = 2 ** (levels - 1)
         super().__init__(rays, (unit, unit), **common)
         self.levels = levels
@@ -241,8 +248,8 @@ class UNet(Backbone, ABC):
             inputs += self.coords_encoding.channels
         width = time_channels or 4 * base_channels
         self.time_embedding = time_embedding(base_channels, width)
-        first = multipliers[0] if self.multiplied else 1
-        widths = [base_channels * n for n in (first, *multipliers)]
+        first = channel_multiplier[0] if self.multiplied else 1
+        widths = [base_channels * n for n in (first, *channel_multiplier)]
         self.in_conv = RingConv2d(inputs, widths[0], ring)
         options = BlockOptions(width, ring, dropout, groups, eps)
         self.build_levels(widths, counts, num_heads, options)

@@ -1,14 +1,13 @@
 """HDiT: an hourglass of transformer blocks on image tokens (paper, figure 4), by ray positions."""
 
-from collections.abc import Sequence
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.backbones.attention import BACKENDS
-from r2flow.backbones.base import Backbone, integers
+from r2flow.backbones.base import Backbone
 from r2flow.backbones.detail import Detail
 from r2flow.backbones.encodings import ENCODINGS, RayEncoding, position_name
 from r2flow.backbones.layers import (
@@ -22,7 +21,9 @@ from r2flow.backbones.layers import (
 )
 from r2flow.backbones.transformer import Block, BlockOptions, Expand, Neighbourhood, merge
 from r2flow.base.errors import InputError
-from r2flow.base.registry import Count, Portion
+from r2flow.base.registry import Bound, Count, Counts, Portion, Size
+
+_Odd = Annotated[Count, Bound("odd", lambda n: n % 2)]
 
 
 class HDiT(Backbone):
@@ -58,30 +59,31 @@ class HDiT(Backbone):
         self,
         rays: Tensor,
         base_channels: Count = 128,
-        depths: Sequence[int] = (3, 3, 3, 3),
-        num_heads: Sequence[int] = (2, 4, 8, 16),
+        depths: Counts = (3, 3, 3, 3),
+        num_heads: Counts = (2, 4, 8, 16),
         time_channels: Count = 256,
         position: str | None = "learnable",
-        window: Sequence[int] = (3, 9),
-        patch: Sequence[int] = (1, 4),
+        window: tuple[_Odd, _Odd] = (3, 9),
+        patch: Size = (1, 4),
         ring: bool = True,
         dropout: Portion = 0.0,
         attention: str = "auto",
-        detail: Sequence[int] | None = None,
+        detail: Size | None = None,
         **common: Any,
     ) -> None:
         levels = len(depths)
-        depths = integers("depths", depths, levels)
+        if len(num_heads) < levels:
+            raise InputError(f"num_heads must be of {levels} levels, as depths, found {num_heads}.")
         # Published configs may list more: the bottleneck takes the last.
-        if len(num_heads) > levels:
-            num_heads = [*num_heads[: levels - 1], num_heads[-1]]
-        heads = integers("num_heads", num_heads, levels)
-        patch_h, patch_w = integers("patch", patch, 2)
+        heads = [*num_heads[: levels - 1], num_heads[-1]]
+        patch_h, patch_w = patch
         super().__init__(rays, (patch_h << levels - 1, patch_w << levels - 1), **common)
         self.patch = (patch_h, patch_w)
         self.levels = levels
         tokens = (rays.shape[1] // patch_h, rays.shape[2] // patch_w)
-        neighbourhood = _neighbourhood(window, ring, attention)
+        if attention != "auto":
+            BACKENDS[attention]  # refuses an unknown name early
+        neighbourhood = Neighbourhood(tuple(window), ring, attention)
 
         def blocks(level: int) -> nn.ModuleList:
             near = neighbourhood if level < levels - 1 else None
@@ -107,9 +109,8 @@ class HDiT(Backbone):
         self.detokenizer = nn.Sequential(RMSNorm(base_channels), zero_initialised(pixels))
         self.detail = None
         if detail is not None:
-            count, wide = integers("detail", detail, 2)
             ends = (self.in_channels, self.out_channels)
-            self.detail = Detail(count, wide, ends, base_channels, self.patch, time_channels, ring)
+            self.detail = Detail(*detail, ends, base_channels, self.patch, time_channels, ring)
         if self.second_time:
             last = zero_initialised(ExactLinear(time_channels, time_channels, bias=False))
             self.interval_embedding = time_embedding(time_channels, dropout).append(last)
@@ -167,15 +168,6 @@ class HDiT(Backbone):
             learned = learned[:, :, columns[::patch_w] // patch_w]
             part.spatial_pe.embedding = nn.Parameter(learned, requires_grad=False)
         return part
-
-
-def _neighbourhood(window: Sequence[int], ring: bool, attention: str) -> Neighbourhood:
-    rows, columns = integers("window", window, 2)
-    if rows % 2 == 0 or columns % 2 == 0:
-        raise InputError(f"the attention window must have odd sizes, found {[rows, columns]}.")
-    if attention != "auto":
-        BACKENDS[attention]  # refuses an unknown name early
-    return Neighbourhood((rows, columns), ring, attention)
 
 
 def time_embedding(channels: int, dropout: float) -> nn.Sequential:

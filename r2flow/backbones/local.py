@@ -1,15 +1,15 @@
 """A small convolutional network at full resolution, for tasks that need a ray's neighbours only."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.backbones.base import Backbone, integers
+from r2flow.backbones.base import Backbone
 from r2flow.backbones.convolutions import TimeChannels, time_embedding
 from r2flow.backbones.layers import wrapped, zero_initialised
+from r2flow.base.registry import Counts
 
 
 class Local(Backbone):
@@ -30,17 +30,16 @@ class Local(Backbone):
         self,
         rays: Tensor,
         channels: TimeChannels = 48,
-        dilations: Sequence[int] = (1, 2, 4, 8, 1),
+        dilations: Counts = (1, 2, 4, 8, 1),
         ring: bool = True,
         **common: Any,
     ) -> None:
         super().__init__(rays, (1, 1), **common)
-        widths = integers("backbone.dilations", dilations, len(dilations))
         # Radius of the receptive field.
-        self.margin = 2 + 2 * sum(widths) if ring else 0
+        self.margin = 2 + 2 * sum(dilations) if ring else 0
         self.time = time_embedding(channels, channels)
         self.image = nn.Conv2d(self.in_channels, channels, 3, padding=1)
-        self.blocks = nn.ModuleList(_Block(channels, width) for width in widths)
+        self.blocks = nn.ModuleList(_Block(channels, width) for width in dilations)
         self.answer = zero_initialised(nn.Conv2d(channels, self.out_channels, 3, padding=1))
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:

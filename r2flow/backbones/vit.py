@@ -1,18 +1,17 @@
 """Plain vision transformer: global attention between large patches, without levels."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.backbones.base import Backbone, integers
+from r2flow.backbones.base import Backbone
 from r2flow.backbones.encodings import FourierFeatures
 from r2flow.backbones.hdit import RayFeatures, time_embedding
 from r2flow.backbones.layers import ExactLinear, RMSNorm, uncast, unshuffle, zero_initialised
 from r2flow.backbones.transformer import Block, BlockOptions
-from r2flow.base.registry import Count, Natural, Portion
+from r2flow.base.registry import Count, Natural, Portion, Size
 
 
 class ViT(Backbone):
@@ -47,11 +46,11 @@ class ViT(Backbone):
         heads: Count = 6,
         time_channels: Count = 256,
         registers: Natural = 4,
-        patch: Sequence[int] = (4, 16),
+        patch: Size = (4, 16),
         dropout: Portion = 0.0,
         **common: Any,
     ) -> None:
-        patch_h, patch_w = integers("patch", patch, 2)
+        patch_h, patch_w = patch
         super().__init__(rays, (patch_h, patch_w), **common)
         self.patch = (patch_h, patch_w)
         rows = rays.shape[1] // patch_h

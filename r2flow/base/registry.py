@@ -4,7 +4,7 @@ constructors' signatures.
 
 import difflib
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
 from importlib.resources import files
@@ -32,6 +32,8 @@ NonNegative = Annotated[float, Field(ge=0)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Portion = Annotated[float, Field(ge=0, lt=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
+Counts = Annotated[Sequence[Count], Field(min_length=1)]
+Size = tuple[Count, Count]  # rows and columns
 
 strict = with_config(STRICT)  # decorates a dataclass of options: no unknown ones, no NaN
 

@@ -38,19 +38,26 @@ def test_resampling_keeps_a_constant_ring_constant(window):
         ({"base_channels": 2}, "base_channels: must be even and at least 4, found 2"),
         (
             {"num_residual_blocks": [1, 2]},
-            r"num_residual_blocks must be 4 integers of at least 1, found \[1, 2\]",
+            r"num_residual_blocks must be of 4 levels, as channel_multiplier, found \[1, 2\]",
         ),
-        ({"channel_multiplier": []}, "channel_multiplier must be 1 integers of at least 1, found"),
+        ({"channel_multiplier": []}, "channel_multiplier: value should have at least 1 item"),
         ({"position": "learnable"}, "no position named 'learnable'; known: fourier_features, none"),
         ({"name": "local", "channels": 5}, "channels: must be even and at least 4, found 5"),
-        ({"name": "hdit", "depths": (1, 0, 1, 1)}, "depths must be 4 integers of at least 1"),
+        (
+            {"name": "hdit", "depths": (1, 0, 1, 1)},
+            "depths.1: input should be greater than or equal",
+        ),
         (
             {"name": "hdit", "base_channels": 16, "num_heads": (3, 2, 2, 2)},
             "16 channels cannot be shared by 3 heads",
         ),
         *(
-            ({"name": "hdit", "detail": detail}, "detail must be 2 integers")
-            for detail in ([2], [0, 8], [2, 8, 8])
+            ({"name": "hdit", "detail": detail}, words)
+            for detail, words in (
+                ([2], "needs the option 'detail.1'"),
+                ([0, 8], "detail.0: input should be greater than or equal to 1"),
+                ([2, 8, 8], "detail: tuple should have at most 2 items"),
+            )
         ),
         (
             {"name": "hdit", "attention": "tile"},

@@ -38,7 +38,7 @@ REFUSED = {
     "sampler.grid=[a,b]": "grid: input should be a valid string, found ['a', 'b']",
     "backbone.base_channels=0": "base_channels: input should be greater than or equal to 1, found 0",
     "encoding.levels=1.5": "levels: must be whole and above 0, found 1.5",
-    "backbone.window=[2,9]": "odd sizes",
+    "backbone.window=[2,9]": "window.0: must be odd, found 2",
     "data.scans={name: simulated}": "data.scans needs data=pairs, found data=simulated",
     "data.reading.projection=unfolding": "leave data.reading out",
     "trainer.val_check_interval=0": "val_check_interval must be above 0",

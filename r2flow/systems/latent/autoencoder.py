@@ -8,20 +8,16 @@ import math
 from collections import OrderedDict
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.backbones.base import integers
 from r2flow.backbones.convolutions import GroupNorm, projection
 from r2flow.backbones.layers import wrapped
 from r2flow.base.errors import InputError
-from r2flow.base.registry import Count, NonNegative
+from r2flow.base.registry import Count, Counts, NonNegative, Size
 from r2flow.systems.latent.quantiser import Quantiser
-
-Size = tuple[int, int]
 
 _SQUARE: Size = (3, 3)
 _FLAT: Size = (1, 4)
@@ -192,8 +188,8 @@ class Autoencoder(nn.Module):
         self,
         channels: Count = 1,
         width: Count = 64,
-        multipliers: Sequence[int] = (1, 2, 2, 4),
-        strides: Sequence[Sequence[int]] = ((1, 2), (2, 2), (2, 2)),
+        multipliers: Counts = (1, 2, 2, 4),
+        strides: Sequence[Size] = ((1, 2), (2, 2), (2, 2)),
         blocks: Count = 2,
         attention: Sequence[int] = (),
         latent_channels: Count = 8,
@@ -205,12 +201,12 @@ class Autoencoder(nn.Module):
     ) -> None:
         super().__init__()
         levels = len(multipliers)
-        widths = [width * n for n in integers("multipliers", multipliers, levels)]
-        self.strides: list[Any] = [tuple(stride) for stride in strides]
+        widths = [width * n for n in multipliers]
+        self.strides = [tuple(stride) for stride in strides]
         if len(strides) != levels - 1 or not UP.keys() >= set(self.strides):
             raise InputError(
                 f"an autoencoder of {levels} levels needs {levels - 1} strides, each [1, 2] or "
-                f"[2, 2]; found {[list(stride) for stride in strides]}."
+                f"[2, 2]; found {list(strides)}."
             )
         self.mask = mask
         self.code_channels = code_channels

@@ -12,10 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.backbones.base import integers
 from r2flow.backbones.convolutions import GroupNorm, projection
 from r2flow.backbones.layers import ExactLinear, at_least_float32, halved, zero_initialised
-from r2flow.base.registry import Count
+from r2flow.base.registry import Count, Counts
 from r2flow.systems.latent.autoencoder import CircularConv2d
 
 
@@ -97,7 +96,7 @@ class LatentUNet(nn.Module):
         self,
         shape: tuple[int, int, int],
         width: Count = 256,
-        multipliers: Sequence[int] = (1, 2, 4),
+        multipliers: Counts = (1, 2, 4),
         blocks: Count = 2,
         attention: Sequence[int] = (1, 2, 4),
         head_channels: Count = 32,
@@ -106,7 +105,7 @@ class LatentUNet(nn.Module):
         super().__init__()
         channels, rows, columns = shape
         levels = len(multipliers)
-        widths = [width * factor for factor in integers("multipliers", multipliers, levels)]
+        widths = [width * factor for factor in multipliers]
         name = "the U-Net of the latents (generator.unet.multipliers)"
         halved(name, (rows, columns), levels - 1)
         condition = 4 * width
