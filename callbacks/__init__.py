@@ -61,14 +61,10 @@ def build_callbacks(options: Options) -> list[Callback]:
             "a run keeps one average of its weights, found callbacks.ema and half_life_ema: null "
             "one."
         )
-    built: list[Callback] = []
-    for name in CALLBACKS:
-        if name in wanted:
-            callback = construct(f"callbacks.{name}", CALLBACKS[name], wanted[name])
-            if not isinstance(callback, Callback):
-                raise InputError(
-                    f"callbacks.{name} must make a Lightning callback, found {callback!r}."
-                )
-            built.append(callback)
+    built = [
+        construct(f"callbacks.{name}", CALLBACKS[name], wanted[name])
+        for name in CALLBACKS
+        if name in wanted
+    ]
     # It saves the state of all others, plug-ins' too.
     return sorted(built, key=lambda callback: isinstance(callback, Stopping))

@@ -190,10 +190,3 @@ def test_a_backbone_for_a_system_with_its_own_network_is_refused(asked: str):
         check(compose(["stage=flow_map", "data=pairs"]), parent=Parent(gan, Path("gan")))
     with pytest.raises(InputError, match="stage=gan has its own network: leave the backbone out"):
         check(compose([*command, asked]), [*command, asked])
-
-
-def test_an_option_called_as_a_key_of_its_group_is_refused(monkeypatch):
-    for table, group in ((BACKBONES, "backbone"), (STAGES, "stage")):
-        monkeypatch.setitem(table._entries, "own", lambda one, name="a": None)
-        with pytest.raises(InputError, match=f"{group} 'own' has an option 'name'"):
-            compose([f"{group}=own"])

@@ -110,13 +110,6 @@ def test_a_velocity_of_ones_own_is_not_exported_as_the_network(network, words, t
         export(checkpoint, tmp_path / "flow.pt2", SHORT, network)
 
 
-def test_a_sampler_of_more_evaluations_than_it_states_is_refused(monkeypatch, tmp_path):
-    sampler = build_sampler("midpoint", steps=2)
-    monkeypatch.setattr(type(sampler), "evaluations", lambda self, generator: 2)  # of 4
-    with pytest.raises(InputError, match="`evaluations`"):
-        export(flow("efficient_unet"), tmp_path / "flow.pt2", sampler)
-
-
 def test_a_network_that_torch_cannot_export_is_refused():
     with pytest.raises(InputError, match="torch cannot export this Flatten: "):
         _traced(torch.nn.Flatten(5), torch.tensor(0.5))

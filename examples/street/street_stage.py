@@ -65,10 +65,8 @@ class LearnStreetMap(LearnFlowMap):
         x_t, target = torch.where(here, x_t, aim[0]), torch.where(here, v, aim[1])
         estimate = self.generator.map()(t, x_t, s)  # type: ignore[operator]
         ends = (s == 1) & (t < s)
-        of_ends, others = (
-            self.loss_of_each(loss, estimate, target) for loss in (self.end_loss, self.loss)
-        )
-        return torch.where(ends, of_ends, others).mean()
+        of_ends = self.end_loss(estimate, target)
+        return torch.where(ends, of_ends, self.loss(estimate, target)).mean()
 
 
 LOSSES.add("gradient_matching", gradient_matching)

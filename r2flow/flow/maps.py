@@ -19,7 +19,7 @@ from r2flow.base.registry import Options, Portion, Registry
 from r2flow.flow.path import expand_time, interpolate
 from r2flow.flow.solvers.fixed import build_grid
 from r2flow.flow.solvers.solution import selected
-from r2flow.flow.times import build_density
+from r2flow.flow.times import TIMES
 
 # u(t, x, s), in the argument order of backbones.
 MeanVelocity = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -64,7 +64,7 @@ class JumpTimes:
         self.share = share
         self.diagonal = diagonal
         self.ends = ends
-        self.velocities = build_density(time or {"name": "u_shaped"})
+        self.velocities = TIMES.build(time or {"name": "u_shaped"})
         self.steps = torch.tensor(steps)
         grids = [build_grid(grid, 0.0, 1.0, count) for count in steps]
         self.times = pad_sequence(grids, batch_first=True, padding_value=math.nan)

@@ -12,8 +12,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from r2flow.base.errors import InputError
-from r2flow.base.registry import Bound, Count, Options, Portion, Positive, Registry
+from r2flow.base.registry import Bound, Count, Portion, Positive, Registry
 from r2flow.flow.solvers.fixed import build_grid
 
 _GOLDEN = -7046029254386353131  # (sqrt(5) - 1) / 2 of 2^64, as a signed integer
@@ -121,18 +120,3 @@ TIMES: Registry[Callable[..., _TimeDensity]] = Registry(
     late=Late,
     discrete=Discrete,
 )
-
-
-def build_density(config: Options) -> _TimeDensity:
-    """Build a density of `TIMES`; InputError: it maps uniform numbers in [0, 1) to others than
-    times, as p(t) does.
-    """
-    density = TIMES.build(config)
-    u = torch.arange(64) / 64
-    t = density(u)
-    if not (isinstance(t, Tensor) and t.shape == u.shape and ((t >= 0) & (t <= 1)).all()):
-        raise InputError(
-            f"time density {config['name']!r} must map u in [0, 1), (B,), to t in [0, 1], (B,): "
-            "its inverse CDF."
-        )
-    return density

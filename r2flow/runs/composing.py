@@ -112,10 +112,6 @@ def add_choices() -> None:
                 node = {**options_of(import_module(module).build_sensor), "name": name}
             else:
                 options = options_of(entry, given=1 if group == "backbone" else 0)
-                if "name" in options:
-                    raise InputError(
-                        f"{group} '{name}' has an option 'name', a key of every {group}: rename it."
-                    )
                 node |= {key: value for key, value in options.items() if key not in given_elsewhere}
             ConfigStore.instance().store(name, node, group=group)
 

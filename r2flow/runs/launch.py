@@ -105,8 +105,6 @@ def _parsed(arguments: Sequence[str]) -> Namespace:
 
     parser.error = refuse  # type: ignore[method-assign]  # the default prints all flags
     parsed = parser.parse_intermixed_args(arguments)  # flags may stand between them
-    if sum(map(bool, (parsed.run, parsed.multirun, parsed.cfg, parsed.info))) > 1:
-        raise InputError("give one of --run, --multirun, --cfg and --info.")
     sweeps = parsed.multirun or "hydra.mode=MULTIRUN" in parsed.overrides
     for text in parsed.overrides if sweeps else ():
         # A sweep over several names is valid.

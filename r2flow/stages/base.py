@@ -398,10 +398,6 @@ class SingleLoss(Stage):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         batch = self.whole_batch(batch)
         loss = self.regression_loss(batch, batch["u"])
-        if not (isinstance(loss, Tensor) and loss.numel() == 1 and loss.requires_grad):
-            raise InputError(
-                f"regression_loss of a {type(self).__name__} must be one number with a gradient."
-            )
         part = batch_idx % (self._trainer.accumulate_grad_batches if self._trainer else 1)
         self._sum = loss.detach() + (self._sum if part else 0.0)
         self.log(

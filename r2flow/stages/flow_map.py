@@ -92,4 +92,4 @@ class LearnFlowMap(Reflow):
             x_t, v = interpolate(batch["noise"], batch["scan"], t)
             mask = expand_time(diagonal, x_t)
             aim = Aim(torch.where(mask, x_t, aim.x_t), torch.where(mask, v, aim.target))
-        return self.loss_of_each(self.loss, u_ts(t, aim.x_t, s), aim.target).mean()
+        return self.loss(u_ts(t, aim.x_t, s), aim.target).mean()

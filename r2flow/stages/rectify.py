@@ -8,9 +8,9 @@ from torch import Tensor
 
 from r2flow.base.errors import InputError
 from r2flow.base.registry import Count
-from r2flow.flow.losses import LOSSES, Loss
+from r2flow.flow.losses import LOSSES
 from r2flow.flow.path import interpolate
-from r2flow.flow.times import build_density
+from r2flow.flow.times import TIMES
 from r2flow.generators import Condition, Flow, Generator
 from r2flow.generators.flow import ode_sampler
 from r2flow.samplers import FixedSteps
@@ -44,7 +44,7 @@ class Rectify(SingleLoss):
             name = type(self.generator).__name__
             raise InputError(f"a {name} needs a condition: give stage=transfer, or its own stage.")
         self.loss = LOSSES[loss or self.default_loss]
-        self.time = build_density(time or self.default_time)
+        self.time = TIMES.build(time or self.default_time)
 
     def condition(self, batch: Batch) -> Condition | None:
         """Condition of the velocity; None here."""
@@ -53,18 +53,8 @@ class Rectify(SingleLoss):
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
         t = self.time(u)
         x_t, u_t = interpolate(batch["x_0"], batch["x_1"], t)
-        return self.loss_of_each(
-            self.loss, self.generator.velocity(t, x_t, self.condition(batch)), u_t
-        ).mean()
-
-    def loss_of_each(self, loss: Loss, v_t: Tensor, u_t: Tensor) -> Tensor:
-        """The loss of each scan of a batch, (B,); InputError: a loss of another shape."""
-        each = loss(v_t, u_t)
-        if each.shape != (len(v_t),):
-            raise InputError(
-                f"a loss must give one value a scan, ({len(v_t)},), found {tuple(each.shape)}."
-            )
-        return each
+        v_t = self.generator.velocity(t, x_t, self.condition(batch))
+        return self.loss(v_t, u_t).mean()
 
 
 class Reflow(Rectify):
@@ -104,7 +94,7 @@ class Distill(Reflow):
                 f"a distilled flow trains at the {steps} times that its steps visit; leave time "
                 "out."
             )
-        self.time = build_density({"name": "discrete", "k": steps, "grid": grid})
+        self.time = TIMES.build({"name": "discrete", "k": steps, "grid": grid})
 
     def prepare_generator(self) -> None:
         self.generator.run_by(FixedSteps(self.hparams["steps"], self.hparams["grid"]), fixed=True)

@@ -10,7 +10,6 @@ from torch import nn
 from r2flow.base.errors import InputError
 from r2flow.base.noise import standard_normal
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.flow.losses import LOSSES
 from r2flow.flow.solvers import solve
 from r2flow.generators import USUAL, build_generator
 from r2flow.samplers import build_sampler
@@ -79,17 +78,6 @@ def test_an_untrained_stage_has_the_loss_of_predicting_nothing():
     x_1 = M + S * torch.stack([standard_normal((1, 32, 32), 0, "evaluation", k) for k in range(64)])
     loss = stage.training_step({"x_0": x_0, "x_1": x_1, "u": torch.rand(64)}, 0)
     assert loss.item() == pytest.approx(M**2 + S**2 + 1, abs=5 / math.sqrt(x_0.numel()))
-
-
-@pytest.mark.parametrize(
-    "wrong", [torch.Tensor.sum, lambda loss: loss[:1], lambda loss: loss[:, None]]
-)
-def test_a_loss_gives_a_value_a_scan(monkeypatch, wrong):
-    monkeypatch.setitem(
-        LOSSES._entries, "wrong", lambda v_t, u_t: wrong((v_t - u_t).square().flatten(1).mean(1))
-    )
-    with pytest.raises(InputError, match=r"one value a scan, \(256,\), found"):
-        Rectify(generator=affine(), loss="wrong").training_step(pairs(0), 0)
 
 
 X_0 = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)

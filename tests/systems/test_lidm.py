@@ -515,7 +515,10 @@ def test_scans_of_a_diffusion_in_bfloat16_have_all_digits():
             {"unet": {"position": "polar"}, "autoencoder": SMALL_AUTOENCODER},
             "'none' or 'learnable', found 'polar'",
         ),
-        ({"autoencoder": {"multipliers": [], "strides": []}}, "multipliers: value should have at least 1 item"),
+        (
+            {"autoencoder": {"multipliers": [], "strides": []}},
+            "multipliers: value should have at least 1 item",
+        ),
         (
             {"autoencoder": {**SMALL_AUTOENCODER, "strides": [[1]]}},
             "needs the option .strides.0.1",
