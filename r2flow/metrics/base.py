@@ -16,6 +16,7 @@ from r2flow.lidar.sensors import Sensor, named_sensor
 from r2flow.metrics.scans import MASK, Scans
 
 SIDES = ("real", "generated")
+BLOCK = 500  # scans: distances from 80,000 others take 320 MB, maps of two blocks 640 MB
 Figures = dict[str, float]  # values by name
 
 
@@ -32,10 +33,10 @@ class Protocol:
     settings: Mapping[str, Any] = field(default_factory=dict)  #: bins, bandwidth, neighbours
 
 
-def blocks(rows: Tensor, size: int) -> Iterator[tuple[slice, Tensor]]:
-    """Split rows (N, D) into blocks of at most `size`: slices, and rows in float64."""
-    for start in range(0, len(rows), size):
-        block = slice(start, start + size)
+def blocks(rows: Tensor) -> Iterator[tuple[slice, Tensor]]:
+    """Split rows (N, D) into blocks of `BLOCK`: slices, and rows in float64."""
+    for start in range(0, len(rows), BLOCK):
+        block = slice(start, start + BLOCK)
         yield block, rows[block].double()
 
 

@@ -9,13 +9,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from r2flow.metrics import FIELD_NAMES
-from r2flow.metrics.base import Protocol, StoredMetric, blocks
+from r2flow.metrics.base import BLOCK, Protocol, StoredMetric, blocks
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor, weights_hash
 from r2flow.metrics.jsd_mmd import squared_distances, squared_mmd
 from r2flow.metrics.scans import Scans
 
-BLOCK = 500  # scans per block: distances from 80,000 others take 320 MB
 NEIGHBOURS = 5  # k of `Manifold`
 TIE = 1e-9  # relative tolerance: neighbours at exactly the radius count as inside
 SAME = 1e-5  # relative tolerance of equal scores
@@ -146,7 +145,7 @@ class KernelDistance(_FeatureMetric):
     biased = False
 
     def values(self, real: Tensor, generated: Tensor) -> list[float]:
-        return [squared_mmd(real, generated, _cubic_kernel, BLOCK, biased=False)]
+        return [squared_mmd(real, generated, _cubic_kernel, biased=False)]
 
 
 def _cubic_kernel(a: Tensor, b: Tensor) -> Tensor:
@@ -184,7 +183,7 @@ class Manifold(_FeatureMetric):
         balls = torch.zeros(len(generated), dtype=torch.float64)
         recalled = []
         covered = []
-        for i, x in blocks(real, BLOCK):
+        for i, x in blocks(real):
             d = squared_distances(x, generated)
             inside = d <= real_radii[i, None]
             balls += inside.sum(0)
@@ -196,9 +195,7 @@ class Manifold(_FeatureMetric):
 
 def _squared_radii(rows: Tensor) -> Tensor:
     """Squared distance of each row to its k-th nearest neighbour, (N,); it is its own first."""
-    nearest = [
-        squared_distances(x, rows).kthvalue(NEIGHBOURS + 1).values for _, x in blocks(rows, BLOCK)
-    ]
+    nearest = [squared_distances(x, rows).kthvalue(NEIGHBOURS + 1).values for _, x in blocks(rows)]
     return torch.cat(nearest)
 
 

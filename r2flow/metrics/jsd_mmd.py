@@ -14,7 +14,6 @@ from r2flow.metrics.base import Figures, StoredMetric, SumMetric, blocks
 from r2flow.metrics.scans import BINS, EXTENT, FAR, NEAR, Scans
 
 SIGMA = 0.5
-BLOCK = 500  # scans per block: two blocks of histograms and their kernel take 250 MB
 HISTOGRAM = {"bins": BINS, "metres": [-EXTENT, EXTENT], "range": [NEAR, FAR]}
 
 
@@ -78,7 +77,7 @@ class MMD(StoredMetric):
         return _histograms(scans)
 
     def values(self, real: Tensor, generated: Tensor) -> list[float]:
-        return [max(squared_mmd(real, generated, _gaussian_kernel, BLOCK, biased=True), 0.0)]
+        return [max(squared_mmd(real, generated, _gaussian_kernel, biased=True), 0.0)]
 
 
 def _gaussian_kernel(a: Tensor, b: Tensor) -> Tensor:
@@ -90,13 +89,9 @@ def _gaussian_kernel(a: Tensor, b: Tensor) -> Tensor:
 
 
 def squared_mmd(
-    x: Tensor,
-    y: Tensor,
-    kernel: Callable[[Tensor, Tensor], Tensor],
-    size: int,
-    biased: bool,
+    x: Tensor, y: Tensor, kernel: Callable[[Tensor, Tensor], Tensor], biased: bool
 ) -> float:
-    """Squared maximum mean discrepancy of two sets, (N, D) and (M, D), by blocks of `size` rows.
+    """Squared maximum mean discrepancy of two sets, (N, D) and (M, D), by blocks of rows.
 
     mean k(x, x') + mean k(y, y') - 2 mean k(x, y); the biased estimate (Gretton et al. 2012)
     includes each row against itself. A constant part of the kernel cancels.
@@ -104,7 +99,7 @@ def squared_mmd(
 
     def mean(a, b):
         total = 0.0
-        for i, rows in blocks(a, size):
+        for i, rows in blocks(a):
             k = kernel(rows, b)
             total += float(k.sum())
             if a is b and not biased:

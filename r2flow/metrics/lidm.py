@@ -23,7 +23,6 @@ FAR = 56.0
 EXTENT = 50
 FINE = 0.05  # cell size of JSD
 COARSE = 0.5  # cell size of MMD
-BLOCK = 500  # scans per block: two blocks of distance maps and occupied cells take 640 MB
 
 
 def _occupied(points: Tensor, cell: float) -> Tensor:
@@ -98,9 +97,9 @@ class MMDLiDM(StoredMetric):
 
     def values(self, real: Tensor, generated: Tensor) -> list[float]:
         nearest = torch.full((len(real),), torch.inf, dtype=torch.float64)
-        for i, x in blocks(real, BLOCK):
+        for i, x in blocks(real):
             a = (x == 0).double()  # occupied cells
-            for _, y in blocks(generated, BLOCK):
+            for _, y in blocks(generated):
                 b = (y == 0).double()
                 to_generated = (a @ y.T) / a.sum(1)[:, None]  # of all pairs, in squared cells
                 to_real = (x @ b.T) / b.sum(1)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.metrics import jsd_mmd, lidm
 from r2flow.metrics.jsd_mmd import JSD, MMD, js_distance
 from r2flow.metrics.lidm import JSDLiDM, MMDLiDM
 from r2flow.metrics.scans import _birds_eye_histogram
@@ -37,7 +36,7 @@ def test_mmd_is_the_mean_over_all_pairs_in_blocks_of_any_size(monkeypatch):
     expected = mean(p[:10], p[:10]) + mean(p[10:], p[10:]) - 2 * mean(p[:10], p[10:])
 
     for block in (3, 1000):
-        monkeypatch.setattr(jsd_mmd, "BLOCK", block)
+        monkeypatch.setattr("r2flow.metrics.base.BLOCK", block)
         sets = counts[:10].astype(float), counts[10:].astype(float)
         assert given(MMD(), *sets)["mmd"] == pytest.approx(expected, rel=1e-9)
 
@@ -68,7 +67,7 @@ def test_jsd_of_the_other_toolbox_counts_scans_that_hold_a_cell():
 
 
 def test_mmd_of_the_other_toolbox_is_the_mean_distance_to_the_best_match(monkeypatch):
-    monkeypatch.setattr(lidm, "BLOCK", 2)
+    monkeypatch.setattr("r2flow.metrics.base.BLOCK", 2)
     real, generated = scans_of(5, 1), scans_of(3, 2)
 
     def chamfer(a, b):

@@ -46,7 +46,7 @@ def brute_force(real, generated, k):
 
 @pytest.mark.parametrize(("k", "block"), [(1, 7), (3, 2000), (5, 10)])
 def test_as_pair_by_pair(k, block, monkeypatch):
-    monkeypatch.setattr(features, "BLOCK", block)
+    monkeypatch.setattr("r2flow.metrics.base.BLOCK", block)
     monkeypatch.setattr(features, "NEIGHBOURS", k)
     draw = np.random.default_rng(k)
     real, generated = (
@@ -91,7 +91,7 @@ def test_the_kernel_distance_is_the_mean_over_all_subsets_in_blocks_of_any_size(
         [kernel_distance(real[list(a)], generated[list(b)]) for a, b in product(*sides)]
     )
     for block in (2, 1000):
-        monkeypatch.setattr(features, "BLOCK", block)
+        monkeypatch.setattr("r2flow.metrics.base.BLOCK", block)
         assert kernel_distance(real, generated) == pytest.approx(expected, rel=1e-9)
 
 

@@ -61,7 +61,7 @@ def test_reference_figures(shared):
 
 
 def test_float32_features_far_from_zero_lose_nothing(monkeypatch):
-    monkeypatch.setattr("r2flow.metrics.features.BLOCK", 400)  # 999 rows in three blocks
+    monkeypatch.setattr("r2flow.metrics.base.BLOCK", 400)  # 999 rows in three blocks
     far = (1e4 + 1e-2 * torch.randn(999, 12, dtype=torch.float64)).float()
     x = far.double().numpy()
     expected = np.cov(x, rowvar=False)
