@@ -157,6 +157,7 @@ def map_of(prior: Correlated) -> MeanVelocity:
     return u
 
 
+@torch.no_grad()
 def moments(
     u: MeanVelocity, method: str, case: Case, y: Tensor, times: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -168,7 +169,7 @@ def moments(
         drawn[0] = max(drawn[0], j)
         return nothing
 
-    means = build_sampler(method).given(u, nothing, *case.measurement(y), times, no_noise)
+    means = build_sampler(method).run(u, nothing, *case.measurement(y), times, no_noise)
     unit = torch.eye(case.width, dtype=torch.float64)
     rows = (1 + drawn[0]) * case.width  # a unit of each value of each noise
 
@@ -177,7 +178,7 @@ def moments(
         e[j * case.width : (j + 1) * case.width] = unit
         return e
 
-    x_1 = build_sampler(method).given(
+    x_1 = build_sampler(method).run(
         u, noise(0), *case.measurement(y[:1].expand(rows, -1)), times, noise
     )
     effect = x_1 - means[:1]

@@ -175,7 +175,7 @@ def override(key: str, value: Any) -> str:
     if value is None or isinstance(value, bool):
         return f"{key}={json.dumps(value)}"
     if isinstance(value, str) and not re.fullmatch(
-        r"(?!(?i:null|true|false|inf|nan)$)[a-zA-Z][\w-]*", value, re.A
+        r"(?!(?i:null|true|false|inf|nan)$)[a-zA-Z/][\w./-]*", value, re.A
     ):
         value = (
             "'" + re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + ("\\'" if m[2] else ""), value) + "'"
@@ -185,5 +185,4 @@ def override(key: str, value: Any) -> str:
 
 def as_override(key: str, path: str | Path) -> str:
     """KEY=PATH quoted for a shell and for Hydra's grammar."""
-    plain = re.fullmatch(r"[a-zA-Z/][\w./-]*/[\w./-]*", str(path), re.A)
-    return shlex.quote(f"{key}={path}" if plain else override(key, str(path)))
+    return shlex.quote(override(key, str(path)))

@@ -116,6 +116,7 @@ def build(config: Options, asked: Sequence[str] = (), parent: Parent | None = No
     if run.chain or run.preview:
         raise InputError("this config is a chain of runs: train it by `r2flow train`.")
     with quiet(), made_with(read_config(run.run_dir) or {}, f"the run in {run.run_dir}"):
+        keys = [key_of(text) for text in asked]
         stage_options = dict(run.stage)
         stage_class = STAGES[stage_options.pop("name")]
         named = stage_options.pop("parent", None)
@@ -123,19 +124,18 @@ def build(config: Options, asked: Sequence[str] = (), parent: Parent | None = No
             parent = find_parent(named["path"] if isinstance(named, Mapping) else named)
         with made_with(parent.config if parent else {}, "the run that it starts from"):
             options = model_options(
-                _given(config, asked, parent),
+                _given(config, keys, parent),
                 parent,
                 stage_class.generator_name,
                 stage_class.needs_pairs,
             )
-        data = _build_data(run, options, asked, parent)
+        data = _build_data(run, options, keys, parent)
         options["encoding"] = data.encoding.described()
         options |= {"parent": parent, "sampler": run.sampler, "few": run.few, "seed": run.seed}
         stage: Stage = construct(
             f"stage '{run.stage['name']}'", stage_class, {**stage_options, **options}
         )
-        groups = {key_of(text).partition(".")[0] for text in asked}
-        if stage.hparams["backbone"] is None and "backbone" in groups:
+        if stage.hparams["backbone"] is None and any(key.startswith("backbone") for key in keys):
             raise InputError(
                 f"stage={run.stage['name']} has its own network: leave the backbone out."
             )
@@ -159,12 +159,11 @@ def check(config: Options, asked: Sequence[str] = (), parent: Parent | None = No
     return run.config
 
 
-def _given(config: Options, asked: Sequence[str], parent: Parent | None) -> Config:
+def _given(config: Options, keys: Sequence[str], parent: Parent | None) -> Config:
     """Options of the model; next to a parent's, only those of the command line."""
     given = {group: config.get(group) for group in MODEL}
     if parent is None:
         return given
-    keys = [key_of(text) for text in asked]
     for group in ("backbone", "sensor", "encoding"):
         if group not in keys:
             options = config[group] or {}
@@ -175,12 +174,11 @@ def _given(config: Options, asked: Sequence[str], parent: Parent | None) -> Conf
 
 
 def _build_data(
-    run: RunConfig, options: Options, asked: Sequence[str], parent: Parent | None
+    run: RunConfig, options: Options, keys: Sequence[str], parent: Parent | None
 ) -> ScanDataModule:
     """The DataModule of a config, for the model's sensor and encoding."""
     data = dict(run.data)
     chosen = construct("data", DataOptions, data)
-    keys = [key_of(text) for text in asked]
     _refuse_unread(data["name"], keys)
     of_simulated = all(part.get("name") == SIMULATED for part in chosen.parts or [data])
     drawer = parent
@@ -190,12 +188,6 @@ def _build_data(
         drawer = find_parent(chosen.pairs.of) if chosen.pairs.of else parent
     theirs = (drawer.config.get("data") or {}).get("reading") if drawer else None
     if data["name"] == PAIRS:
-        for key, value in chosen.chosen.items():
-            given = {"data.reading", f"data.reading.{key}"}.intersection(keys)
-            if given and value != (theirs or {}).get(key):
-                raise InputError(
-                    f"data.reading.{key} is that of the flow that draws the pairs: leave it out."
-                )
         data["reading"] = theirs
     elif theirs and not of_simulated:  # the rays of simulated scans are given
         data["reading"] = {
@@ -221,13 +213,15 @@ def _build_data(
     return module
 
 
-def _refuse_unread(name: str, asked: Sequence[str]) -> None:
+def _refuse_unread(name: str, keys: Sequence[str]) -> None:
     """Refuse keys of the command line that this kind of data does not read."""
-    given = {".".join(key.split(".")[:2]) for key in asked}
+    given = {".".join(key.split(".")[:2]) for key in keys}
     if name not in (SIMULATED, MIXED, PAIRS) and "data.scenes" in given:
         raise InputError("scans in files are no simulated scenes: leave data.scenes out.")
     if name == SIMULATED and "data.reading" in given:
         raise InputError("simulated scans are not read from files: leave data.reading out.")
+    if name == PAIRS and "data.reading" in given:
+        raise InputError("data.reading is that of the flow that draws the pairs: leave it out.")
     if name != PAIRS and "data.pairs" in given:
         raise InputError(f"data={name} has no pairs (data=pairs has): leave data.pairs out.")
 

@@ -75,22 +75,10 @@ class Posterior(OnGrid):
                 velocity.register_hook(lambda _: progress())
             return velocity
 
-        return self.given(u, x_0, y, known, self.times(), noise)
-
-    def given(
-        self,
-        u: MeanVelocity,
-        x_0: Tensor,
-        y: Tensor,
-        known: Tensor,
-        times: Tensor,
-        noise: Fresh = None,
-    ) -> Tensor:
-        """x_1 given y, (B, ...), on a time grid from 0 to 1."""
         with torch.inference_mode(False), torch.no_grad():
             # Vector-Jacobian products need tensors that autograd can save.
-            x_0, y, known, times = (part.clone() for part in (x_0, y, known, times.to(x_0)))
-            return self.run(u, x_0, y, known, times, noise)
+            x_0, y, known = (part.clone() for part in (x_0, y, known))
+            return self.run(u, x_0, y, known, self.times().to(x_0), noise)
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,8 @@ def times(steps: int, grid: str = "uniform") -> Tensor:
 def sample_posterior(
     u, x_0: Tensor, y: Tensor, known: Tensor, method: str, times: Tensor, noise=None
 ) -> Tensor:
-    return build_sampler(method).given(u, x_0, y, known, times, noise)
+    with torch.no_grad():
+        return build_sampler(method).run(u, x_0, y, known, times.to(x_0), noise)
 
 
 def numbered(shape: tuple[int, ...]):

@@ -246,11 +246,11 @@ def test_links_take_what_concerns_them_and_at_last_what_is_given_to_them_alone()
     first, second = links_of(chain, "runs/x", given)
     assert first.overrides == (
         "trainer.max_steps=5", "data=folder", "data.root='a b'", "seed=3", *OF_SCANS, *ALL_LINKS,
-        "backbone.depths=[1]", "trainer.max_steps=5", "run_dir='runs/x/rf1'",
+        "backbone.depths=[1]", "trainer.max_steps=5", "run_dir=runs/x/rf1",
     )  # fmt: skip
     assert second.overrides == (
-        "experiment=reflow", "stage.loss=mse", "stage.parent='runs/x/rf1'", "seed=3", "data.pairs.num=9",
-        *ALL_LINKS, "seed=2", "run_dir='runs/x/rf2'",
+        "experiment=reflow", "stage.loss=mse", "stage.parent=runs/x/rf1", "seed=3", "data.pairs.num=9",
+        *ALL_LINKS, "seed=2", "run_dir=runs/x/rf2",
     )  # fmt: skip
 
 

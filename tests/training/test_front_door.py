@@ -61,7 +61,7 @@ REFUSED = {
     "data=mixed & data.parts=[{name: simulated}] & data.split=train": "data.split does nothing for mixed scans: leave it out",
     "data.pairs.num=5": "data=simulated has no pairs (data=pairs has): leave data.pairs out",
     "stage=reflow & data=pairs & stage.parent=street & data.drives=[1]": "data.drives does nothing for pairs scans: leave it out",
-    "stage=reflow & data=pairs & stage.parent=street & data.reading={convention: lidm}": "convention is that of the flow",
+    "stage=reflow & data=pairs & stage.parent=street & data.reading={convention: lidm}": "data.reading is that of the flow",
     "preview=street": "a chain of runs",
     "trainer.limit_test_batches=3": "Could not override 'trainer.limit_test_batches'",
     "data.workers=1000000000": "workers: input should be less than or equal to 1000, found 1000000000",
