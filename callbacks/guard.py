@@ -90,8 +90,8 @@ class Guard(L.Callback):
                 trainer,
                 f"stopped at step {step}: steps skipped in a row for a non-finite loss or "
                 f"gradient: {self.in_a_row}, {self.total} in the run. Loss {loss:g}, loss "
-                f"scale {scale:g} of {trainer.precision}; {describe_batch(trainer)}. "
-                f"{last_good(trainer)} Look at these scans; try trainer.precision=32-true or, in "
+                f"scale {scale:g} of {trainer.precision}; {_describe_batch(trainer)}. "
+                f"{_last_good(trainer)} Look at these scans; try trainer.precision=32-true or, in "
                 "a run of another name, a lower stage.learning_rate.",
             )
         if trainer.is_global_zero and not overflow:
@@ -109,7 +109,7 @@ class Guard(L.Callback):
                 self._end(
                     trainer,
                     f"stopped at step {trainer.global_step}: the weights or their average are no "
-                    f"longer finite, so no checkpoint was written. {last_good(trainer)} Start "
+                    f"longer finite, so no checkpoint was written. {_last_good(trainer)} Start "
                     "under another name with a lower stage.learning_rate.",
                 )
 
@@ -125,7 +125,7 @@ class Guard(L.Callback):
         vars(self).update(state_dict)
 
 
-def last_good(trainer: L.Trainer) -> str:
+def _last_good(trainer: L.Trainer) -> str:
     """Sentence about the newest checkpoint of the run."""
     newest = next(iter(checkpoints_of(trainer.default_root_dir)), None)
     if newest is None:
@@ -133,7 +133,7 @@ def last_good(trainer: L.Trainer) -> str:
     return f"The last good checkpoint is {newest}, from which the same command resumes."
 
 
-def describe_batch(trainer: L.Trainer) -> str:
+def _describe_batch(trainer: L.Trainer) -> str:
     """Describe the images and scans of the current step, on all devices and in all accumulated
     batches.
     """

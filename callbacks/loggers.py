@@ -22,7 +22,7 @@ from lightning.pytorch.loggers import (
 from r2flow.base.errors import InputError, one_line, require
 from r2flow.base.registry import Registry
 
-PROJECT = "r2flow"
+_PROJECT = "r2flow"
 
 
 def _by_age(folder: Path, pattern: str) -> list[Path]:
@@ -34,7 +34,7 @@ def _wandb(run_dir: Path) -> Logger:
     require("loggers=[wandb]", "wandb", "wandb")
     folders = _by_age(run_dir / "wandb", "*run-*-*")
     run_id = folders[-1].name.rsplit("-", 1)[1] if folders else None
-    return WandbLogger(name=run_dir.name, save_dir=run_dir, project=PROJECT, id=run_id)
+    return WandbLogger(name=run_dir.name, save_dir=run_dir, project=_PROJECT, id=run_id)
 
 
 def _mlflow(run_dir: Path) -> Logger:
@@ -53,7 +53,7 @@ def _mlflow(run_dir: Path) -> Logger:
         files = _by_age(store, "*/*/meta.yaml")
         run_id = files[-1].parent.name if files else None
     try:
-        return MLFlowLogger(PROJECT, run_dir.name, uri, run_id=run_id)
+        return MLFlowLogger(_PROJECT, run_dir.name, uri, run_id=run_id)
     except Exception as error:  # as of a scheme that it does not know
         raise InputError(f"loggers=[mlflow]: {one_line(str(error))}") from error
 
@@ -72,7 +72,7 @@ LOGGERS: Registry[Callable[[Path], Logger]] = Registry(
 
 # Functions that log a picture, (H, W, 3) uint8, by class of logger; other loggers do not take
 # pictures.
-PICTURES: dict[type, Callable[[Any, str, np.ndarray, int], None]] = {
+_PICTURES: dict[type, Callable[[Any, str, np.ndarray, int], None]] = {
     TensorBoardLogger: lambda log, name, pixels, step: log.experiment.add_image(
         name, pixels, step, dataformats="HWC"
     ),
@@ -97,8 +97,8 @@ class LearningRates(LearningRateMonitor):
 def log_picture(loggers: Iterable[Logger], name: str, pixels: np.ndarray, step: int) -> None:
     """Log a picture, (H, W, 3) uint8, to every logger that takes pictures."""
     for logger in loggers:
-        if type(logger) in PICTURES:
-            PICTURES[type(logger)](logger, name, pixels, step)
+        if type(logger) in _PICTURES:
+            _PICTURES[type(logger)](logger, name, pixels, step)
 
 
 def log_config(loggers: Iterable[Logger], config: Mapping[str, Any]) -> None:

@@ -37,7 +37,7 @@ __all__ = ["Result", "Run", "build", "check", "compose", "fit"]
 log = logging.getLogger("r2flow")
 
 # Errors of gloo and NCCL after a peer process has ended.
-PEER_LOST = (
+_PEER_LOST = (
     r"(?i)connection .*(close|reset)|broken pipe|process exited|gloo.*"
     r"(timed out|(read|write) error)|NCCL"
 )
@@ -133,7 +133,7 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
         if (
             run.trainer.world_size > 1
             and stopping.received is None
-            and re.search(PEER_LOST, str(error))
+            and re.search(_PEER_LOST, str(error))
         ):
             if any(map(_failed, getattr(run.trainer.strategy.launcher, "procs", ()))):
                 raise InputError(

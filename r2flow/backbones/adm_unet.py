@@ -36,7 +36,7 @@ class ADMUNet(UNet):
         for level, count in enumerate(counts):
             attention = heads if level == deepest else 0
             for _ in range(count):
-                block = ADMBlock(width, widths[level + 1], options, attention)
+                block = _ADMBlock(width, widths[level + 1], options, attention)
                 self.down_blocks.append(block)
                 width = widths[level + 1]
                 skips.append(width)
@@ -44,13 +44,13 @@ class ADMUNet(UNet):
                 self.down_blocks.append(_resampling(width, options, up=False))
                 skips.append(width)
         self.mid_blocks = nn.ModuleList(
-            [ADMBlock(width, width, options, heads), ADMBlock(width, width, options)]
+            [_ADMBlock(width, width, options, heads), _ADMBlock(width, width, options)]
         )
         self.up_blocks = nn.ModuleList()
         for level in reversed(range(self.levels)):
             attention = heads if level == deepest else 0
             for _ in range(counts[level] + 1):
-                block = ADMBlock(width + skips.pop(), widths[level + 1], options, attention)
+                block = _ADMBlock(width + skips.pop(), widths[level + 1], options, attention)
                 self.up_blocks.append(nn.ModuleList([block]))
                 width = widths[level + 1]
             if level:
@@ -79,7 +79,7 @@ class ADMUNet(UNet):
         return self.out_conv(h)
 
 
-class ADMBlock(ResidualBlock):
+class _ADMBlock(ResidualBlock):
     """A residual block with optional resampling of the normalised input and the skip, and
     attention.
 
@@ -108,5 +108,5 @@ class ADMBlock(ResidualBlock):
         return self.self_attn_block((self.resample(self.skip_conv(x)) + residual) * self.scale)
 
 
-def _resampling(width: int, options: BlockOptions, up: bool) -> ADMBlock:
-    return ADMBlock(width, width, options, resample=Resample((1, 1), up, options.ring))
+def _resampling(width: int, options: BlockOptions, up: bool) -> _ADMBlock:
+    return _ADMBlock(width, width, options, resample=Resample((1, 1), up, options.ring))

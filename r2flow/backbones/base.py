@@ -43,7 +43,7 @@ class Backbone(ExactBuffers):
         out_channels: Channels C' of the output; None: C.
         second_time: Whether the network takes s.
         prediction: What the network predicts: `velocity`, or `data` or `noise`, from which the
-            velocity is computed by `reparametrise`.
+            velocity is computed by `_reparametrise`.
         data_std: Standard deviation of the data, for `precondition`; None: no preconditioning.
     """
 
@@ -104,7 +104,7 @@ class Backbone(ExactBuffers):
             return self._velocity(t, x, s).to(x.dtype)
         image = at_least_float32(x[:, : self.out_channels])
         if self.data_std is None:
-            skip, out = reparametrise(t, self.prediction)
+            skip, out = _reparametrise(t, self.prediction)
             inner = x
         else:
             into, skip, out = precondition(t, self.data_std)
@@ -198,7 +198,7 @@ def precondition(t: Tensor, data_std: float) -> tuple[Tensor, Tensor, Tensor]:
     return into, (t * data_std**2 - (1 - t)) / variance, data_std * into
 
 
-def reparametrise(t: Tensor, prediction: Prediction) -> tuple[Tensor, Tensor]:
+def _reparametrise(t: Tensor, prediction: Prediction) -> tuple[Tensor, Tensor]:
     """Factors of a network F that predicts x_1 (`data`) or x_0 (`noise`), (B or 1, 1, 1, 1) each:
 
         v(t, x) = skip(t) x + out(t) F(t, x)

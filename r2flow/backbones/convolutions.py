@@ -106,7 +106,7 @@ class BlockOptions:
         return GroupNorm(self.groups, channels, self.eps, affine)
 
 
-class AdaGroupNorm(nn.Module):
+class _AdaGroupNorm(nn.Module):
     """norm(x) (1 + scale) + shift, with (scale, shift) = W silu(c) + b of a condition c."""
 
     def __init__(self, channels: int, options: BlockOptions) -> None:
@@ -119,7 +119,7 @@ class AdaGroupNorm(nn.Module):
         return torch.addcmul(shift, self.norm(x), 1 + scale)
 
 
-class SinusoidalTime(nn.Module):
+class _SinusoidalTime(nn.Module):
     """sin(f_i t), then cos(f_i t), with f_i = 10^(-4 i / (C / 2 - 1)).
 
     t is not scaled: a flow's time or a log-SNR.
@@ -139,7 +139,7 @@ class SinusoidalTime(nn.Module):
 def time_embedding(channels: int, out_channels: int, bias: bool = True) -> nn.Sequential:
     """t (B,) to (B, out_channels): sinusoids, Linear, SiLU, Linear; `bias` is that of the last."""
     return nn.Sequential(
-        SinusoidalTime(channels),
+        _SinusoidalTime(channels),
         ExactLinear(channels, out_channels),
         nn.SiLU(),
         ExactLinear(out_channels, out_channels, bias=bias),
@@ -156,7 +156,7 @@ class ResidualBlock(nn.Module):
         self.scale = nn.Buffer(torch.tensor(0.5**0.5))
         self.norm1 = options.norm(channels)
         self.conv1 = RingConv2d(channels, out_channels, options.ring)
-        self.norm2 = AdaGroupNorm(out_channels, options)
+        self.norm2 = _AdaGroupNorm(out_channels, options)
         self.dropout = nn.Dropout(options.dropout)
         self.conv2 = zero_initialised(RingConv2d(out_channels, out_channels, options.ring))
 

@@ -83,7 +83,7 @@ class HDiT(Backbone):
         tokens = (rays.shape[1] // patch_h, rays.shape[2] // patch_w)
         if attention != "auto":
             BACKENDS[attention]  # refuses an unknown name early
-        neighbourhood = Neighbourhood(tuple(window), ring, attention)
+        neighbourhood = Neighbourhood(window, ring, attention)
 
         def blocks(level: int) -> nn.ModuleList:
             near = neighbourhood if level < levels - 1 else None

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from r2flow.base.errors import InputError
 
-Layer = TypeVar("Layer", bound=nn.Module)
+_Layer = TypeVar("_Layer", bound=nn.Module)
 
 _BAND = 1024  # tokens
 
@@ -64,7 +64,7 @@ def uncast(layer: nn.Module, x: Tensor) -> Tensor:
         return cast(Tensor, layer(x.to(next(layer.parameters()).dtype)))
 
 
-def zero_initialised(layer: Layer) -> Layer:
+def zero_initialised(layer: _Layer) -> _Layer:
     """Set the weights and bias of a layer to zero: a residual block then starts as the identity."""
     for parameter in layer.parameters():
         nn.init.zeros_(parameter)

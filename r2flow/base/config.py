@@ -129,15 +129,15 @@ def at_most_three(texts: Sequence[str]) -> str:
     return "; ".join(texts[:3]) + (f" (and {len(texts) - 3} more)" if len(texts) > 3 else "")
 
 
-MOST = 10**6  # values of a config
+_MOST = 10**6  # values of a config
 
 
 def check_tree(config: Options) -> None:
     """Raise an error for a config that contains itself or one part too often, as YAML and pickles
     can, or whose groups are not groups.
     """
-    if _size(config, {}) > MOST:
-        raise ValueError(f"it has more than {MOST:,} values")
+    if _size(config, {}) > _MOST:
+        raise ValueError(f"it has more than {_MOST:,} values")
     for key in ("stage", "data", "trainer"):
         if not isinstance(config.get(key) or {}, Mapping):
             raise ValueError(f"its '{key}' is not a group of keys")
@@ -148,7 +148,7 @@ def _size(value: Any, known: dict[int, int]) -> int:
     if not isinstance(value, Mapping | list | tuple):
         return 1
     if id(value) not in known:
-        known[id(value)] = MOST  # while it is walked
+        known[id(value)] = _MOST  # while it is walked
         parts = value.values() if isinstance(value, Mapping) else value
         known[id(value)] = 1 + sum(_size(part, known) for part in parts)
     return known[id(value)]

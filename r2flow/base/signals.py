@@ -89,11 +89,11 @@ def stop_at_once(number: int, frame: FrameType | None = None) -> None:
     while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
         frame = frame.f_back
     if frame is not None:  # within an import, whose compiled modules swallow or replace exceptions
-        end_at_once(number)
+        _end_at_once(number)
     raise Stopped(code_of(number))
 
 
-def end_at_once(number: int, frame: FrameType | None = None) -> None:
+def _end_at_once(number: int, frame: FrameType | None = None) -> None:
     """_Handler during imports and at exit, without cleanup."""
     os.write(2, b"stopped\n")
     os._exit(code_of(number))
@@ -104,13 +104,13 @@ def handling_signals_of_program() -> Iterator[None]:
     """Answer stop signals by one line during a whole program, its imports and its exit."""
     # Registered first, so that it is called last.
     atexit.register(partial(install_handlers, signal.SIG_IGN))
-    with handling_signals(end_at_once):
+    with handling_signals(_end_at_once):
         try:
             yield
         finally:
             atexit.unregister(install_handlers)
             # Registered last, so that it is called first.
-            atexit.register(install_handlers, end_at_once)
+            atexit.register(install_handlers, _end_at_once)
 
 
 def end_with_parent(end: Callable[[], object] = lambda: os._exit(1)) -> None:

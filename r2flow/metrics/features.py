@@ -16,9 +16,9 @@ from r2flow.metrics.jsd_mmd import squared_distances, squared_mmd
 from r2flow.metrics.scans import Scans
 
 NEIGHBOURS = 5  # k of `Manifold`
-TIE = 1e-9  # relative tolerance: neighbours at exactly the radius count as inside
-SAME = 1e-5  # relative tolerance of equal scores
-FEW = (
+_TIE = 1e-9  # relative tolerance: neighbours at exactly the radius count as inside
+_SAME = 1e-5  # relative tolerance of equal scores
+_FEW = (
     "fewer scans than features on a side: its covariance has no full rank, and the distance is too "
     "large; compare it only with distances of as many scans."
 )
@@ -127,7 +127,7 @@ class FrechetDistance(_FeatureMetric):
 
     def values(self, real: Tensor, generated: Tensor) -> list[float]:
         if min(len(real), len(generated)) <= self.extractor.dim:
-            self.remarks.append(FEW)
+            self.remarks.append(_FEW)
         return [_frechet_distance(*gaussian(real), *gaussian(generated))]
 
 
@@ -178,8 +178,8 @@ class Manifold(_FeatureMetric):
         middle = real[:BLOCK].double().mean(0)  # subtracted for accuracy far from 0
         real = real.double() - middle
         generated = generated.double() - middle
-        real_radii = _squared_radii(real) * (1 + TIE)
-        generated_radii = _squared_radii(generated) * (1 + TIE)
+        real_radii = _squared_radii(real) * (1 + _TIE)
+        generated_radii = _squared_radii(generated) * (1 + _TIE)
         balls = torch.zeros(len(generated), dtype=torch.float64)
         recalled = []
         covered = []
@@ -233,7 +233,7 @@ def area(negative: Tensor, positive: Tensor) -> float:
     """P(positive > negative) + P(equal) / 2 for scores (N,) and (M,)."""
     difference = positive[None] - negative[:, None]
     # Features of a scan differ by rounding between batches.
-    equal = difference.abs() < SAME * (1 + positive.abs())
+    equal = difference.abs() < _SAME * (1 + positive.abs())
     return float(torch.where(equal, 0.5, (difference > 0).double()).mean())
 
 

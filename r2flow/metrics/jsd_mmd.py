@@ -13,8 +13,8 @@ from torch import Tensor
 from r2flow.metrics.base import Figures, StoredMetric, SumMetric, blocks
 from r2flow.metrics.scans import BINS, EXTENT, FAR, NEAR, Scans
 
-SIGMA = 0.5
-HISTOGRAM = {"bins": BINS, "metres": [-EXTENT, EXTENT], "range": [NEAR, FAR]}
+_SIGMA = 0.5
+_HISTOGRAM = {"bins": BINS, "metres": [-EXTENT, EXTENT], "range": [NEAR, FAR]}
 
 
 def js_distance(a: ndarray, b: ndarray) -> float:
@@ -45,7 +45,7 @@ class JSD(SumMetric):
 
     name = "jsd"
     representation = "bird's-eye histogram"
-    settings: ClassVar = {**HISTOGRAM, "logarithm": "natural", "root": True}
+    settings: ClassVar = {**_HISTOGRAM, "logarithm": "natural", "root": True}
     width = BINS * BINS
     biased = True
 
@@ -69,7 +69,7 @@ class MMD(StoredMetric):
 
     name = "mmd"
     representation = "bird's-eye histogram"
-    settings: ClassVar = {**HISTOGRAM, "kernel": "Gaussian", "sigma": SIGMA, "estimate": "biased"}
+    settings: ClassVar = {**_HISTOGRAM, "kernel": "Gaussian", "sigma": _SIGMA, "estimate": "biased"}
     biased = True
     fewest = 1
 
@@ -85,7 +85,7 @@ def _gaussian_kernel(a: Tensor, b: Tensor) -> Tensor:
     used = (a.sum(0) + b.sum(0)) > 0  # over half of the cells are beyond the mask or always empty
     p = a[:, used] / a.sum(1, keepdim=True)
     q = b[:, used] / b.sum(1, keepdim=True)
-    return torch.expm1(squared_distances(p, q).div_(-2 * SIGMA**2))
+    return torch.expm1(squared_distances(p, q).div_(-2 * _SIGMA**2))
 
 
 def squared_mmd(

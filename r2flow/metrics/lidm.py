@@ -18,18 +18,18 @@ from r2flow.metrics.base import StoredMetric, blocks
 from r2flow.metrics.jsd_mmd import JSD
 from r2flow.metrics.scans import Scans
 
-NEAR = 1.0  # metres, as all lengths here
-FAR = 56.0
-EXTENT = 50
+_NEAR = 1.0  # metres, as all lengths here
+_FAR = 56.0
+_EXTENT = 50
 FINE = 0.05  # cell size of JSD
 COARSE = 0.5  # cell size of MMD
 
 
 def _occupied(points: Tensor, cell: float) -> Tensor:
-    """Sorted indices (K,) of occupied ground-plane cells, of 2 EXTENT / cell cells per side."""
+    """Sorted indices (K,) of occupied ground-plane cells, of 2 _EXTENT / cell cells per side."""
     r = points.norm(dim=1)
-    inside = (r > NEAR) & (r < FAR) & (points[:, :2].abs() < EXTENT).all(1)
-    side = round(2 * EXTENT / cell)
+    inside = (r > _NEAR) & (r < _FAR) & (points[:, :2].abs() < _EXTENT).all(1)
+    side = round(2 * _EXTENT / cell)
     x, y = (torch.floor(points[inside, :2] / cell).long() + side // 2).T
     return torch.unique(x * side + y)
 
@@ -43,14 +43,14 @@ class JSDLiDM(JSD):
 
     name = "jsd_lidm"
     representation = "occupied cells from above"
-    mask = (NEAR, FAR)
+    mask = (_NEAR, _FAR)
     settings: ClassVar = {
         "cell": FINE,
-        "metres": [-EXTENT, EXTENT],
+        "metres": [-_EXTENT, _EXTENT],
         "logarithm": "natural",
         "root": True,
     }
-    width = round(2 * EXTENT / FINE) ** 2
+    width = round(2 * _EXTENT / FINE) ** 2
 
     def rows(self, scans: Scans) -> Tensor:
         """Indices of occupied cells, (B, K) float64, filled up with `width`."""
@@ -76,17 +76,17 @@ class MMDLiDM(StoredMetric):
 
     name = "mmd_lidm"
     representation = "occupied cells from above"
-    mask = (NEAR, FAR)
+    mask = (_NEAR, _FAR)
     settings: ClassVar = {
         "cell": COARSE,
-        "metres": [-EXTENT, EXTENT],
+        "metres": [-_EXTENT, _EXTENT],
         "distance": "Chamfer, squared, halved",
     }
     biased = True
     fewest = 1
 
     def rows(self, scans: Scans) -> Tensor:
-        side = round(2 * EXTENT / COARSE)
+        side = round(2 * _EXTENT / COARSE)
         maps = torch.full((len(scans), side * side), torch.nan)
         for squared, points in zip(maps, scans.points, strict=True):
             free = np.ones((side, side), dtype=bool)
@@ -105,4 +105,4 @@ class MMDLiDM(StoredMetric):
                 to_real = (x @ b.T) / b.sum(1)
                 chamfer = (to_generated + to_real) / 2
                 nearest[i] = torch.minimum(nearest[i], chamfer.amin(1))
-        return [float(nearest.mean()) * (COARSE / (2 * EXTENT)) ** 2]
+        return [float(nearest.mean()) * (COARSE / (2 * _EXTENT)) ** 2]

@@ -23,20 +23,20 @@ from r2flow.metrics.surfaces import bridged, normals
 # Edges of bins. Those of ranges in metres are the same for every sensor: sets of sensors with other
 # limits are compared with each other.
 GRADIENTS = np.concatenate([[0], np.geomspace(0.01, 80, 24)])  # metres
-STEPS = np.array([-20, -6, -2, -0.6, -0.2, -0.05, -0.02, 0.02, 0.05, 0.2, 0.6, 2, 6, 20])  # metres
+_STEPS = np.array([-20, -6, -2, -0.6, -0.2, -0.05, -0.02, 0.02, 0.05, 0.2, 0.6, 2, 6, 20])  # metres
 RUNS = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 256, 512, 1025, 2**14 + 1])
 REFLECTANCES = np.linspace(0, 1.0001, 14)
-INCIDENCES = np.cos(np.linspace(np.pi / 2, 0, 11))  # cosines, in steps of 9 degrees
-DENSITIES = np.array([0.5, 1.5, 2.5, 4.5, 8.5, 16.5, 32.5, 64.5, 128.5, 256.5, np.inf])  # points
+_INCIDENCES = np.cos(np.linspace(np.pi / 2, 0, 11))  # cosines, in steps of 9 degrees
+_DENSITIES = np.array([0.5, 1.5, 2.5, 4.5, 8.5, 16.5, 32.5, 64.5, 128.5, 256.5, np.inf])  # points
 NORMALS = np.linspace(-1, 1, 21)
 COSINES = np.linspace(0, 1, 21)
-DROPS = np.geomspace(3, 80, 13)  # metres
-RANGES = np.geomspace(1.45, 80, 17)  # metres
+_DROPS = np.geomspace(3, 80, 13)  # metres
+_RANGES = np.geomspace(1.45, 80, 17)  # metres
 
-SECTORS = 8
-RANGES_APART = 128  # pixels of a pair of ranges are 1/128 turn apart
-REFLECTANCES_APART = 512
-MOST_ROWS = 1024
+_SECTORS = 8
+_RANGES_APART = 128  # pixels of a pair of ranges are 1/128 turn apart
+_REFLECTANCES_APART = 512
+_MOST_ROWS = 1024
 REFLECTANCE = "reflectance pairs"  # the line that needs reflectance
 LACKING = "a set has no reflectance: the panel's mean leaves reflectance pairs out."
 
@@ -75,7 +75,7 @@ def _steps_by_sector(scan: Scan) -> ndarray:
     """
     after = np.roll(scan.r, -1, -1)
     step = np.where((scan.r > 0) & (after > 0), after - scan.r, np.nan)
-    return np.stack([np.histogram(part, STEPS)[0] for part in np.array_split(step, SECTORS, -1)])
+    return np.stack([np.histogram(part, _STEPS)[0] for part in np.array_split(step, _SECTORS, -1)])
 
 
 def _run_lengths(scan: Scan) -> ndarray:
@@ -91,8 +91,8 @@ def _run_lengths(scan: Scan) -> ndarray:
 def _changes_row(scan: Scan) -> ndarray:
     """Per row, pairs of neighbours with exactly one return, all, and the image's, (3, 1024)."""
     returned = scan.r > 0
-    changes = (returned != np.roll(returned, -1, -1)).sum(1)[:MOST_ROWS]
-    counts = np.zeros((3, MOST_ROWS))
+    changes = (returned != np.roll(returned, -1, -1)).sum(1)[:_MOST_ROWS]
+    counts = np.zeros((3, _MOST_ROWS))
     counts[0, : len(changes)] = changes
     counts[1, : len(changes)] = returned.shape[1]
     counts[2] = returned.size
@@ -105,13 +105,13 @@ def _drop_range(scan: Scan) -> ndarray:
     The range of a missing ray is the mean of its neighbours in the row; gaps over 16 columns are
     not counted.
     """
-    return _drop_rate(bridged(scan.r, scan.r > 0), scan.r == 0, DROPS)
+    return _drop_rate(bridged(scan.r, scan.r > 0), scan.r == 0, _DROPS)
 
 
 def _drop_incidence(scan: Scan) -> ndarray:
     """`_drop_rate` per bin of the angle of incidence, (3, 10), estimated as in `_drop_range`."""
     _, cosine = scan.surfaces
-    return _drop_rate(bridged(cosine, np.isfinite(cosine)), scan.r == 0, INCIDENCES)
+    return _drop_rate(bridged(cosine, np.isfinite(cosine)), scan.r == 0, _INCIDENCES)
 
 
 def _pairs(x: ndarray, returned: ndarray, edges: ndarray, parts: int) -> ndarray:
@@ -123,14 +123,14 @@ def _pairs(x: ndarray, returned: ndarray, edges: ndarray, parts: int) -> ndarray
 
 def _range_pairs(scan: Scan) -> ndarray:
     """Joint histogram of ranges of pixels 2.8 degrees or one column apart, 16 x 16 bins."""
-    return _pairs(scan.r, scan.r > 0, RANGES, RANGES_APART)
+    return _pairs(scan.r, scan.r > 0, _RANGES, _RANGES_APART)
 
 
 def _reflectance_pairs(scan: Scan) -> ndarray:
     """Joint histogram of reflectances 0.7 degrees or one column apart, 13 x 13 bins; 0 without."""
     if scan.q is None:
         return np.zeros((len(REFLECTANCES) - 1) ** 2)
-    return _pairs(scan.q, scan.r > 0, REFLECTANCES, REFLECTANCES_APART)
+    return _pairs(scan.q, scan.r > 0, REFLECTANCES, _REFLECTANCES_APART)
 
 
 def _rate_distance(a: ndarray, b: ndarray) -> float:
@@ -189,24 +189,24 @@ PANEL: dict[str, _Member] = {
     "gradient, elevation": _histogram_of(
         lambda scan: _differences(scan.r[1:], scan.r[:-1]), GRADIENTS
     ),
-    "steps by sector": _Member(_steps_by_sector, SECTORS * (len(STEPS) - 1)),
+    "steps by sector": _Member(_steps_by_sector, _SECTORS * (len(_STEPS) - 1)),
     "run lengths": _histogram_of(_run_lengths, RUNS, weighted=True),
-    "changes per row": _Member(_changes_row, 3 * MOST_ROWS, _row_distance),
-    "drop rate by range": _Member(_drop_range, 3 * (len(DROPS) - 1), _rate_distance),
-    "drop rate by incidence": _Member(_drop_incidence, 3 * (len(INCIDENCES) - 1), _rate_distance),
+    "changes per row": _Member(_changes_row, 3 * _MOST_ROWS, _row_distance),
+    "drop rate by range": _Member(_drop_range, 3 * (len(_DROPS) - 1), _rate_distance),
+    "drop rate by incidence": _Member(_drop_incidence, 3 * (len(_INCIDENCES) - 1), _rate_distance),
     "surface normals": _histogram_of(lambda scan: scan.surfaces[0], NORMALS),
     "incidence": _histogram_of(lambda scan: scan.surfaces[1], COSINES),
-    "range pairs": _Member(_range_pairs, (len(RANGES) - 1) ** 2),
+    "range pairs": _Member(_range_pairs, (len(_RANGES) - 1) ** 2),
     REFLECTANCE: _Member(_reflectance_pairs, (len(REFLECTANCES) - 1) ** 2, _reflectance_distance),
     # over points, the number of points in the same 1.6 m bird's-eye cell
-    "bird's-eye density": _histogram_of(lambda scan: scan.birds_eye, DENSITIES, weighted=True),
+    "bird's-eye density": _histogram_of(lambda scan: scan.birds_eye, _DENSITIES, weighted=True),
 }
-ENDS = np.cumsum([member.size for member in PANEL.values()])
+_ENDS = np.cumsum([member.size for member in PANEL.values()])
 
 
 def _panel_rows(scans: Scans) -> Tensor:
     """Concatenated counts of all members per scan, (B, D) float64."""
-    rows = np.zeros((len(scans), ENDS[-1]))
+    rows = np.zeros((len(scans), _ENDS[-1]))
     images = scans.images.cpu().numpy()
     for row, image, birds_eye in zip(rows, images, scans.birds_eye, strict=True):
         q = image[1] if scans.has_reflectance else None
@@ -227,7 +227,7 @@ def distances(a: ndarray, b: ndarray) -> Figures:
     0 if equal, NaN if neither has any.
     """
     found = {}
-    counts = zip(np.split(a, ENDS[:-1]), np.split(b, ENDS[:-1]), strict=True)
+    counts = zip(np.split(a, _ENDS[:-1]), np.split(b, _ENDS[:-1]), strict=True)
     for (name, member), (x, y) in zip(PANEL.items(), counts, strict=True):
         found[name] = member.distance(x, y) if (x + y).any() else float("nan")
     return found
@@ -249,7 +249,7 @@ class Panel(SumMetric):
         "ranges": [1.45, 80],
         "distance": "Jensen-Shannon distance of histograms, |a - b| of rates or a over 100 b",
     }
-    width = int(ENDS[-1])
+    width = int(_ENDS[-1])
     uses_reflectance = True
     biased = True
 

@@ -6,9 +6,9 @@ from numpy import ndarray
 from r2flow.lidar.interpolation import nearest_known
 from r2flow.lidar.sensors import Sensor
 
-SPAN = 2  # columns to either side for a surface's direction; range noise dominates for 1
-STEP = 0.15  # relative to range; larger differences separate objects
-GAP = 16  # columns; longer gaps are sky or occluded, not dropped rays
+_SPAN = 2  # columns to either side for a surface's direction; range noise dominates for 1
+_STEP = 0.15  # relative to range; larger differences separate objects
+_GAP = 16  # columns; longer gaps are sky or occluded, not dropped rays
 
 
 def normals(r: ndarray, sensor: Sensor) -> tuple[ndarray, ndarray]:
@@ -25,7 +25,7 @@ def normals(r: ndarray, sensor: Sensor) -> tuple[ndarray, ndarray]:
     size = np.sqrt((n**2).sum(0))
     usable = (r > 0) & (size > 0)
     for other in _neighbours(r):
-        usable &= (other > 0) & (np.abs(other - r) < STEP * r)
+        usable &= (other > 0) & (np.abs(other - r) < _STEP * r)
     n = n / np.where(usable, size, np.nan)
     return n[2], np.abs((n * d).sum(0))
 
@@ -35,10 +35,10 @@ def _neighbours(x: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray]:
     padded = np.pad(x, [(0, 0)] * (x.ndim - 2) + [(1, 1), (0, 0)])
     above = padded[..., :-2, :]
     below = padded[..., 2:, :]
-    return above, below, np.roll(x, SPAN, -1), np.roll(x, -SPAN, -1)  # azimuth falls with w
+    return above, below, np.roll(x, _SPAN, -1), np.roll(x, -_SPAN, -1)  # azimuth falls with w
 
 
-def bridged(x: ndarray, known: ndarray, gap: int = GAP) -> ndarray:
+def bridged(x: ndarray, known: ndarray, gap: int = _GAP) -> ndarray:
     """Fill unknown values of x, (..., W), by the mean of the nearest known ones in their row.
 
     Those are one to the left and one to the right, periodic in W. Gaps of more than `gap` columns

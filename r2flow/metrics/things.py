@@ -12,11 +12,11 @@ from r2flow.lidar.sensors import Sensor
 from r2flow.metrics.base import Figures, SumMetric
 from r2flow.metrics.scans import Scans
 
-WALL_LENGTH = 4.0  # metres, as all lengths here; see the docstring of `Things` for all limits
-POLE_WIDTH = 0.4
-POLE_CLEARANCE = 1.0
-REACH = 20.0  # of poles and cars
-TURNS = np.deg2rad(np.arange(0, 90, 3))
+_WALL_LENGTH = 4.0  # metres, as all lengths here; see the docstring of `Things` for all limits
+_POLE_WIDTH = 0.4
+_POLE_CLEARANCE = 1.0
+_REACH = 20.0  # of poles and cars
+_TURNS = np.deg2rad(np.arange(0, 90, 3))
 LINES = ("straight walls", "right angles", "poles", "cars")
 
 
@@ -130,7 +130,7 @@ def _walls(s: Returns) -> tuple[ndarray, ndarray, ndarray]:
     first = np.flatnonzero(joined)
     last = after[first]
     while len(first):
-        full = np.abs(z[last] - z[first]) >= WALL_LENGTH
+        full = np.abs(z[last] - z[first]) >= _WALL_LENGTH
         end[first[full]] = last[full]
         on = ~full & joined[last] & (after[last] != first)
         first = first[on]
@@ -165,24 +165,24 @@ def _walls(s: Returns) -> tuple[ndarray, ndarray, ndarray]:
 def poles(s: Returns) -> ndarray:
     """Horizontal positions, (P, 2)."""
     before = np.argsort(s.after)
-    joined = _near(s, s.after, POLE_WIDTH)
+    joined = _near(s, s.after, _POLE_WIDTH)
     gap = (s.column[s.after] - s.column) % s.sensor.columns
-    aside = gap * np.minimum(s.bins, s.bins[s.after]) >= POLE_CLEARANCE
-    free_after = aside | (s.far[s.after] > s.far + POLE_CLEARANCE)
-    free_before = (aside | (s.far > s.far[s.after] + POLE_CLEARANCE))[before]
+    aside = gap * np.minimum(s.bins, s.bins[s.after]) >= _POLE_CLEARANCE
+    free_after = aside | (s.far[s.after] > s.far + _POLE_CLEARANCE)
+    free_before = (aside | (s.far > s.far[s.after] + _POLE_CLEARANCE))[before]
     # Runs of joined returns: a closed ring has no ends, all others have two.
     run = _components(len(s.p), np.flatnonzero(joined), s.after[joined])
     first = np.flatnonzero(~joined[before])
     last = np.flatnonzero(~joined)
     first = first[np.argsort(run[first])]
     last = last[np.argsort(run[last])]
-    thin = s.stands[first] & free_before[first] & free_after[last] & (s.far[first] <= REACH)
-    thin &= np.abs(s.z[last] - s.z[first]) < POLE_WIDTH
+    thin = s.stands[first] & free_before[first] & free_after[last] & (s.far[first] <= _REACH)
+    thin &= np.abs(s.z[last] - s.z[first]) < _POLE_WIDTH
     first = first[thin]
     last = last[thin]
     ends = s.p[[first, last], :2]
     row = s.row[first]
-    pairs = cKDTree(ends.mean(0)).query_pairs(POLE_WIDTH, output_type="ndarray")
+    pairs = cKDTree(ends.mean(0)).query_pairs(_POLE_WIDTH, output_type="ndarray")
     a, b = pairs[np.abs(np.diff(row[pairs])[:, 0]) <= 2].T
     label = _components(len(row), a, b)
     near, _ = _extremes(label, s.far[first])
@@ -207,17 +207,17 @@ def cars(s: Returns) -> ndarray:
     foot, top = _extremes(label, s.above)
     least, _ = _extremes(label, np.column_stack([s.far, s.row, s.bins]))
     near, row, column = least.T
-    held = (near <= REACH) & (foot < 0.5) & (top >= 1) & (top <= 2.2)
+    held = (near <= _REACH) & (foot < 0.5) & (top >= 1) & (top <= 2.2)
     elevation = np.array(s.sensor.elevations)[row.astype(int)]
     held &= elevation <= s.sensor.row_edges[0] - 1.5
     at = np.flatnonzero(s.stands & held[label])
     number, label, count = np.unique(label[at], return_inverse=True, return_counts=True)
-    turned = s.z[at, None] * np.exp(-1j * TURNS)
+    turned = s.z[at, None] * np.exp(-1j * _TURNS)
     sides = np.stack([turned.real, turned.imag], 1)
     low, high = _extremes(label, sides)  # (C, 2, turns) each
     face = np.where(np.abs(low) < np.abs(high), low, high)  # the two sides towards the sensor
     distance = np.abs(sides - face[label]).min(1)
-    mean = np.zeros((len(number), len(TURNS)))
+    mean = np.zeros((len(number), len(_TURNS)))
     np.add.at(mean, label, distance / count[label, None])
     turn = mean.argmin(1)
     on_face = distance[np.arange(len(at)), turn[label]] <= 0.3
@@ -225,7 +225,7 @@ def cars(s: Returns) -> ndarray:
     low = low[cars, :, turn]
     high = high[cars, :, turn]
     width, length = np.sort(high - low, 1).T
-    middle = (low + high) @ [0.5, 0.5j] * np.exp(1j * TURNS[turn])
+    middle = (low + high) @ [0.5, 0.5j] * np.exp(1j * _TURNS[turn])
     columns = np.unique(label * s.sensor.columns + s.column[at]) // s.sensor.columns
     seen = np.bincount(columns, minlength=len(number)) * column[number]
     fits = (seen >= 1.2) & (length <= 5.5) & (width <= 2.4)

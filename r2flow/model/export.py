@@ -95,7 +95,7 @@ def _recorded(
     return torch.stack([*(x for *_, x in recorder.calls), x_1]).flatten(1), recorder.calls
 
 
-class Decoded(nn.Module):
+class _Decoded(nn.Module):
     """Decode x_1 to range in metres and reflectance, (B, 2 or 1, H, W), and points in metres, (B,
     3, H, W).
     """
@@ -112,13 +112,13 @@ class Decoded(nn.Module):
         return scan, unproject(scan[:, :1], self.rays)
 
 
-class Scans(nn.Module):
+class _Scans(nn.Module):
     """x_0 to decoded scans, with all network evaluations unrolled."""
 
     def __init__(self, flow: RectifiedFlow, how: Tableau) -> None:
         super().__init__()
         self.network = flow.backbone
-        self.decoded = Decoded(flow.space)
+        self.decoded = _Decoded(flow.space)
         self.how = how
 
     def forward(self, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -174,7 +174,7 @@ def export(
         raise InputError(
             f"v(t, x) of a {type(flow).__name__} is more than its network: export a sampler."
         )
-    write = FORMATS[path.suffix.removeprefix(".")]
+    write = _FORMATS[path.suffix.removeprefix(".")]
     how = sampler if isinstance(sampler, Sampler) else flow.choose(sampler)
     steps = None if network else tableau(flow, how)
     if write is _write_onnx:
@@ -215,7 +215,7 @@ def _write_pt2(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) 
     if how is None:
         program = _traced(flow.backbone, *_network_inputs(flow, (2,)))
     else:
-        program = _traced(Scans(flow, how), torch.zeros(2, *flow.noise_shape))
+        program = _traced(_Scans(flow, how), torch.zeros(2, *flow.noise_shape))
     file = io.BytesIO()
     torch.export.save(program, file, extra_files={NOTES: json.dumps(notes)})
     return file.getvalue()
@@ -227,14 +227,14 @@ def _write_onnx(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any])
     inputs = _network_inputs(flow, (2,) if how is None else ())
     network = to_onnx(_traced(flow.backbone, *inputs), ["t", "x", "s"][: len(inputs)], ["v"])
     if how is not None:
-        decoded = _traced(Decoded(flow.space), torch.zeros(2, *flow.noise_shape))
+        decoded = _traced(_Decoded(flow.space), torch.zeros(2, *flow.noise_shape))
         ends = to_onnx(decoded, ["x_1"], ["scan", "points"])
         network = sampler_graph(network, ends, how.times, how.second, how.states.numpy())
     network.metadata_props.add(key="r2flow", value=json.dumps(notes))
     return network.SerializeToString()
 
 
-FORMATS = Registry("export format", pt2=_write_pt2, onnx=_write_onnx)
+_FORMATS = Registry("export format", pt2=_write_pt2, onnx=_write_onnx)
 
 
 def _network_inputs(flow: RectifiedFlow, shape: tuple[int, ...]) -> list[Tensor]:
@@ -290,7 +290,7 @@ def compare(
     """Compare the first scans of seed 0 by the file and by the flow."""
     flow = checkpoint.generator
     noise = Draws(0, range(num)).start(flow.noise_shape)
-    expected, _ = Decoded(flow.space)(flow(noise, sampler=sampler).x)
+    expected, _ = _Decoded(flow.space)(flow(noise, sampler=sampler).x)
     found = run(exported.path, noise)["scan"]
     other = (expected[:, :1] > 0) != (found[:, :1] > 0)
     apart = (expected - found).abs().masked_fill(other, 0)

@@ -33,8 +33,8 @@ from r2flow.runs.folder import has_ended
 from r2flow.runs.launch import job_folder
 from r2flow.training import Run, build, fit
 
-PLAN = "plan.json"
-HELD_OUT = "simulated:1000"  # a seed that no run trains on
+_PLAN = "plan.json"
+_HELD_OUT = "simulated:1000"  # a seed that no run trains on
 _TRIAL = 12  # steps that measure the seconds of one
 _LENGTHS = ("max_steps", "val_check_interval")
 _RESERVED = ("seed", "run_dir", "name", "chain", "preview")
@@ -143,7 +143,7 @@ class Ablation:
         for own in self.variants.values():
             if compose(own)["data"]["name"] != SIMULATED:
                 raise InputError("name scans that no run trains on, by --real SCANS.")
-        return HELD_OUT
+        return _HELD_OUT
 
     @cached_property
     def runs(self) -> dict[str, list[Path]]:
@@ -195,7 +195,7 @@ class Ablation:
 
     def _plan(self) -> Mapping[str, int] | None:
         """Steps of each combination, from the folder's plan or measured now; None: as given."""
-        path = self.out / PLAN
+        path = self.out / _PLAN
         given = {"keys": list(self.keys), "seeds": self.seeds, "budget": self.budget}
         if path.is_file():
             plan = read_json(path)

@@ -31,7 +31,7 @@ from r2flow.stages.base import Stage
 
 log = logging.getLogger("r2flow")
 
-EXPECTED_WARNINGS = (
+_EXPECTED_WARNINGS = (
     ".*does not have many workers.*",
     "Total length of .list. across ranks is zero.*",
     ".*smaller than the logging interval.*",
@@ -41,8 +41,8 @@ EXPECTED_WARNINGS = (
     ".*your dataloader is not resumable.*",  # it resumes by the trainer's step
 )
 
-Named = Annotated[Options, Bound("a group with a name", lambda group: "name" in group)]
-InRuns = Annotated[
+_Named = Annotated[Options, Bound("a group with a name", lambda group: "name" in group)]
+_InRuns = Annotated[
     str, Bound("a folder in runs", lambda name: name.strip("./") and ".." not in Path(name).parts)
 ]
 
@@ -62,17 +62,17 @@ class RunConfig:
     they are for.
     """
 
-    stage: Named  # class of `STAGES`, with its options
+    stage: _Named  # class of `STAGES`, with its options
     backbone: Options | None  # the following four: as in `Stage`
     sensor: Options
     encoding: Options
-    data: Named  # `ScanDataModule`
+    data: _Named  # `ScanDataModule`
     trainer: Options  # Lightning's Trainer
     callbacks: Mapping[str, Options | None]  # classes of `CALLBACKS`
     samples: SampleOptions
     run_dir: Annotated[str, Bound("a folder", lambda name: name.strip("/ "))]
     seed: Seed
-    name: InRuns | int | float = "run"
+    name: _InRuns | int | float = "run"
     experiment: str | Sequence[str] | None = None
     generator: Options | str | None = None
     sampler: Options | None = None
@@ -308,7 +308,7 @@ def quiet(repeated: bool = True) -> Iterator[None]:
         logging.getLogger(name).setLevel(level)
     try:
         with warnings.catch_warnings():
-            for message in EXPECTED_WARNINGS:
+            for message in _EXPECTED_WARNINGS:
                 warnings.filterwarnings("ignore", message=message)
             yield
     finally:

@@ -39,7 +39,7 @@ from r2flow.runs.composing import (
 )
 
 
-class JobEnded(RuntimeError):
+class _JobEnded(RuntimeError):
     """A job of a sweep ended before its run was finished; arguments: exit code and folder."""
 
 
@@ -61,13 +61,13 @@ def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str
             parsed = _parsed(_with_plugins(arguments, plugins) or ["experiment=demo"])
             _run_hydra(parsed, command, codes, errors)
             if errors:  # jobs have printed theirs, and come last
-                raise min(errors, key=lambda error: isinstance(error, JobEnded))
+                raise min(errors, key=lambda error: isinstance(error, _JobEnded))
             return max(codes, default=0)
     except SystemExit as end:
         if end.code:
             raise
         return 0  # of Hydra after --help
-    except JobEnded as error:
+    except _JobEnded as error:
         # A remote launcher raises the first only.
         jobs = [job.args for job in errors or [error]]
         failed = [folder for code, folder in jobs if code != LATER]
@@ -186,7 +186,7 @@ def _sweep_job(command: Sequence[str], given: Sequence[str]) -> None:
     if code in map(code_of, STOPPING):
         raise Stopped(code, "the sweep stopped; the same command resumes there")
     if code:
-        raise JobEnded(code, str(run_dir))
+        raise _JobEnded(code, str(run_dir))
 
 
 def _chain(settings: Config, given: Sequence[str], folders: Sequence[str]) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-LEAST_CHANNELS = 8  # fewer: input or output layer of an image
+_LEAST_CHANNELS = 8  # fewer: input or output layer of an image
 
 
 class Muon(torch.optim.AdamW):
@@ -66,8 +66,8 @@ class Muon(torch.optim.AdamW):
 
 
 def is_hidden_matrix(p: Tensor) -> bool:
-    """Whether a weight has at least `LEAST_CHANNELS` output and input channels."""
-    return p.ndim >= 2 and min(p.shape[:2]) >= LEAST_CHANNELS
+    """Whether a weight has at least `_LEAST_CHANNELS` output and input channels."""
+    return p.ndim >= 2 and min(p.shape[:2]) >= _LEAST_CHANNELS
 
 
 def orthogonalised(matrix: Tensor) -> Tensor:

@@ -24,23 +24,23 @@ from r2flow.metrics.scans import Scans
 from r2flow.model.parts import NOTES
 from r2flow.model.tensor_files import read_tensors, read_torch
 
-R2FLOW = "https://github.com/kazuto1011/r2flow/releases/download/weights"
-BONNETAL = "http://www.ipb.uni-bonn.de/html/projects/bonnetal/lidar/semantic/models"
+_R2FLOW = "https://github.com/kazuto1011/r2flow/releases/download/weights"
+_BONNETAL = "http://www.ipb.uni-bonn.de/html/projects/bonnetal/lidar/semantic/models"
 
 SOURCES: Registry[str] = Registry(
     "network with published weights",
-    rangenet53=f"{BONNETAL}/darknet53-1024.tar.gz",
-    rangenet21=f"{R2FLOW}/rangenet21_lidm.tar.gz",
+    rangenet53=f"{_BONNETAL}/darknet53-1024.tar.gz",
+    rangenet21=f"{_R2FLOW}/rangenet21_lidm.tar.gz",
     pointnet="https://github.com/microsoft/SpareNet/raw/main/Frechet/cls_model_39.pth",
-    minkowskinet=f"{R2FLOW}/minkowskinet_lidm.tar.gz",
-    spvcnn=f"{R2FLOW}/spvcnn_lidm.tar.gz",
+    minkowskinet=f"{_R2FLOW}/minkowskinet_lidm.tar.gz",
+    spvcnn=f"{_R2FLOW}/spvcnn_lidm.tar.gz",
 )
 
 # Parameter files in an archive.
-PARTS = ("backbone", "segmentation_decoder", "segmentation_head", "model.ckpt")
+_PARTS = ("backbone", "segmentation_decoder", "segmentation_head", "model.ckpt")
 Tensors = dict[str, Tensor]  # by name
 
-LARGEST = 2**31  # maximum file size in bytes; the largest network has 0.2 GB
+_LARGEST = 2**31  # maximum file size in bytes; the largest network has 0.2 GB
 
 
 class Extractor(nn.Module, ABC):
@@ -135,7 +135,7 @@ def weights_hash(extractor: Extractor) -> str:
 
 def _read_published(path: Path) -> Tensors:
     """Read tensors by name from a file, an archive or a folder."""
-    with reading_errors(path) if path.is_dir() else reading(path, LARGEST, "file of weights"):
+    with reading_errors(path) if path.is_dir() else reading(path, _LARGEST, "file of weights"):
         if path.suffix == ".safetensors":
             return read_tensors(path)[0]
         tensors: Tensors = {}
@@ -147,21 +147,21 @@ def _read_published(path: Path) -> Tensors:
             part = read_torch(io.BytesIO(content), name)
             tensors |= part.get("state_dict", part)
         if not tensors:
-            raise InputError(f"it holds none of {', '.join(PARTS)}; give the published archive.")
+            raise InputError(f"it holds none of {', '.join(_PARTS)}; give the published archive.")
         return tensors
 
 
 def _contents(path: Path) -> Iterator[tuple[str, bytes]]:
-    """Names and contents of a file, or of the files of `PARTS` in a folder or a tar archive."""
+    """Names and contents of a file, or of the files of `_PARTS` in a folder or a tar archive."""
     if path.is_dir():
-        for name in PARTS:
+        for name in _PARTS:
             if (path / name).is_file():
                 yield name, (path / name).read_bytes()
     elif tarfile.is_tarfile(path):
         with tarfile.open(path) as tar:
             for member in tar:
                 name = PurePosixPath(member.name).name
-                file = tar.extractfile(member) if member.isreg() and name in PARTS else None
+                file = tar.extractfile(member) if member.isreg() and name in _PARTS else None
                 if file is not None:
                     yield name, file.read()
     else:

@@ -24,16 +24,16 @@ from r2flow.metrics.scans import Scans
 BANDS = 2  # of rows
 SECTORS = 8  # of azimuth
 FINE = 0.005  # metres, or relative to full reflectance: lower limit of steps
-SAME = 0.0025  # metres: neighbours are equal up to rounding in files
+_SAME = 0.0025  # metres: neighbours are equal up to rounding in files
 EDGE = 0.5  # metres between neighbours on different objects
-RANGES = (0, 5, 10, 20, 40, torch.inf)  # metres
-REFLECTANCES = (0, 0.1, 0.25, 0.5, torch.inf)
+_RANGES = (0, 5, 10, 20, 40, torch.inf)  # metres
+_REFLECTANCES = (0, 0.1, 0.25, 0.5, torch.inf)
 FEW = 0.01  # share of rays in a cell; statistics of fewer rays shrink to the centre
 FAR_OUT = 5.0  # distance from the centre in scales beyond which features grow logarithmically
 
 # Ends of the names of features: see `Handcrafted`.
-SPREAD = ", spread"
-BEAMS = ", beams"
+_SPREAD = ", spread"
+_BEAMS = ", beams"
 SECTORED = ", sectors"
 
 # Centre and spread of each statistic, by name.
@@ -59,7 +59,7 @@ def _statistics(r: Tensor, q: Tensor | None) -> Iterator[tuple[str, Tensor, Tens
     yield "single returns", m * (1 - right) * (1 - left), every
     log_range = torch.log2(r + 1)
     yield "log-range", log_range, m
-    for low, high in pairwise(RANGES):
+    for low, high in pairwise(_RANGES):
         yield f"beyond {low} m", ((r > low) & (r <= high)).to(r), every
     step = _right(r) - r
     both = m * right
@@ -67,7 +67,7 @@ def _statistics(r: Tensor, q: Tensor | None) -> Iterator[tuple[str, Tensor, Tens
     yield "row step", _size(step), both
     yield "row edges", edge, every
     yield "row slant", torch.tanh(step / EDGE), both
-    yield "row equal", (step.abs() < SAME).to(r), both
+    yield "row equal", (step.abs() < _SAME).to(r), both
     for far in (8, 64):
         yield f"row step of {far}", _size(_right(r, far) - r), m * _right(m, far)
     before = _right(step, -1)
@@ -90,7 +90,7 @@ def _statistics(r: Tensor, q: Tensor | None) -> Iterator[tuple[str, Tensor, Tens
     if q is None:
         return
     yield "reflectance", q, m
-    for low, high in pairwise(REFLECTANCES):
+    for low, high in pairwise(_REFLECTANCES):
         yield f"reflectance from {low}", ((q >= low) & (q < high)).to(r) * m, every
     step = _right(q) - q
     before = _right(step, -1)
@@ -129,8 +129,8 @@ def _agreement(a: Tensor, b: Tensor) -> Tensor:
 class Handcrafted(Extractor):
     """Features of range and reflectance: means and spreads of `_statistics` in 2 bands of rows.
 
-    Some are means in 8 sectors. Names with `SPREAD` are standard deviations within a band; names
-    with `BEAMS` are means over the band of differences between the means of neighbouring rows,
+    Some are means in 8 sectors. Names with `_SPREAD` are standard deviations within a band; names
+    with `_BEAMS` are means over the band of differences between the means of neighbouring rows,
     |x(h - 1) - 2 x(h) + x(h + 1)|.
     """
 
@@ -169,12 +169,12 @@ class Handcrafted(Extractor):
             sums = masked.sum(-1)
             counts = where.sum(-1)
             mean, share = found[name] = _cells(sums, counts, BANDS, w)
-            if name + SPREAD in self.scales:
+            if name + _SPREAD in self.scales:
                 square, _ = _cells(torch.linalg.vecdot(masked, x), counts, BANDS, w)
                 spread = (square - mean**2).clamp(min=0).sqrt()
-                found[name + SPREAD] = torch.stack([spread, share])
-            if name + BEAMS in self.scales:
-                found[name + BEAMS] = _unevenness(sums, counts)
+                found[name + _SPREAD] = torch.stack([spread, share])
+            if name + _BEAMS in self.scales:
+                found[name + _BEAMS] = _unevenness(sums, counts)
             if name + SECTORED in self.scales:
                 found[name + SECTORED] = _cells(masked.sum(-2), where.sum(-2), SECTORS, h)
         values, shares = torch.cat([found[name] for name in self.scales], 2)

@@ -18,12 +18,12 @@ from r2flow.base.errors import InputError
 from r2flow.metrics.extractors.base import Extractor, Tensors
 from r2flow.metrics.scans import Scans
 
-WIDTHS = (32, 64, 128, 256, 512, 1024)
+_WIDTHS = (32, 64, 128, 256, 512, 1024)
 
 # Statistics of SemanticKITTI, the training set of the published networks: range, x, y, z in metres,
 # reflectance.
-MEAN = (12.12, 10.88, 0.23, -1.04, 0.21)
-STD = (12.32, 11.47, 6.91, 0.86, 0.16)
+_MEAN = (12.12, 10.88, 0.23, -1.04, 0.21)
+_STD = (12.32, 11.47, 6.91, 0.86, 0.16)
 
 
 def _convolution(convolution: nn.Module, channels: int) -> nn.Sequential:
@@ -75,19 +75,19 @@ class _RangeNet(Extractor):
     def __init__(self, num_classes: int = 20) -> None:
         super().__init__()
         channels = 4 + self.needs_reflectance
-        stem = nn.Conv2d(channels, WIDTHS[0], 3, padding=1, bias=False)
-        self.stem = _convolution(stem, WIDTHS[0])
+        stem = nn.Conv2d(channels, _WIDTHS[0], 3, padding=1, bias=False)
+        self.stem = _convolution(stem, _WIDTHS[0])
         for level in range(1, 6):
-            down = _Level(WIDTHS[level - 1], WIDTHS[level], self.blocks[level - 1])
+            down = _Level(_WIDTHS[level - 1], _WIDTHS[level], self.blocks[level - 1])
             self.add_module(f"enc{level}", down)
         for level in range(5, 0, -1):
-            self.add_module(f"dec{level}", _Level(WIDTHS[level], WIDTHS[level - 1], 1))
+            self.add_module(f"dec{level}", _Level(_WIDTHS[level], _WIDTHS[level - 1], 1))
         self.head = None
         if num_classes:
-            classifier = nn.Conv2d(WIDTHS[0], num_classes, 3, padding=1)
+            classifier = nn.Conv2d(_WIDTHS[0], num_classes, 3, padding=1)
             self.head = nn.Sequential(nn.Identity(), classifier)
         # Not persistent, since the published files hold only parameters.
-        statistics = torch.tensor([MEAN, STD])[:, :channels, None, None]
+        statistics = torch.tensor([_MEAN, _STD])[:, :channels, None, None]
         self.register_buffer("mean", statistics[0], persistent=False)
         self.register_buffer("std", statistics[1], persistent=False)
 
@@ -161,7 +161,7 @@ class RangeNet21(_RangeNet):
 
 # Substitutions from names of the original release, applied in order. The head's file uses the bare
 # name "1.weight".
-NAMES = (
+_NAMES = (
     (r"^(backbone|decoder)\.", ""),
     (r"^1\.", "head.1."),
     (r"^conv1\.", "stem.0."),
@@ -179,6 +179,6 @@ NAMES = (
 
 def _translate(name: str) -> str:
     """Translate a parameter name of the original release; keep names of r2flow."""
-    for pattern, replacement in NAMES:
+    for pattern, replacement in _NAMES:
         name = re.sub(pattern, replacement, name)
     return name

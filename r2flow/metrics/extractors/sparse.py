@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 # Indices of input and output voxels per offset.
-KernelMap = list[tuple[Tensor, Tensor]]
+_KernelMap = list[tuple[Tensor, Tensor]]
 
 
 def offsets(size: int) -> list[tuple[int, int, int]]:
@@ -56,18 +56,18 @@ class VoxelGrid:
         return VoxelGrid((self.coords // 2).unique(dim=0), finer=self)
 
     @cached_property
-    def around(self) -> KernelMap:
+    def around(self) -> _KernelMap:
         """Kernel map of a kernel of 3^3 with stride 1."""
         return self._pairs(self, self.coords, 3)
 
     @cached_property
-    def inside(self) -> KernelMap:
+    def inside(self) -> _KernelMap:
         """Kernel map from the finer grid: a kernel of 2^3 with stride 2."""
         assert self.finer is not None
         return self._pairs(self.finer, self.coords * 2, 2)
 
     @staticmethod
-    def _pairs(inputs: "VoxelGrid", places: Tensor, size: int) -> KernelMap:
+    def _pairs(inputs: "VoxelGrid", places: Tensor, size: int) -> _KernelMap:
         """Voxels of `inputs` at each offset from the output voxels' places, which both exist."""
         pairs = []
         for offset in offsets(size):

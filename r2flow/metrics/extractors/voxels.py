@@ -30,11 +30,13 @@ from r2flow.metrics.extractors.sparse import (
 )
 from r2flow.metrics.scans import Scans
 
-VOXEL = 0.05  # metres
-SECTORS = 16
-NEAR = 4.0  # metres: evenly spaced edges of distance sectors from NEAR to FAR, except the first, 0
-FAR = 56.0
-WIDTHS = (16, 16, 32, 64, 128, 128, 64, 48, 48)  # stem, four levels down, four up
+_VOXEL = 0.05  # metres
+_SECTORS = 16
+_NEAR = (
+    4.0  # metres: evenly spaced edges of distance sectors from _NEAR to _FAR, except the first, 0
+)
+_FAR = 56.0
+_WIDTHS = (16, 16, 32, 64, 128, 128, 64, 48, 48)  # stem, four levels down, four up
 
 
 def _voxelise(points: Tensor) -> tuple[Tensor, Tensor]:
@@ -45,7 +47,7 @@ def _voxelise(points: Tensor) -> tuple[Tensor, Tensor]:
     the networks were trained without. Points at the origin are ignored.
     """
     points = points[points.any(1)]
-    coords = (points / VOXEL).round().long()
+    coords = (points / _VOXEL).round().long()
     if len(points):
         coords -= coords.amin(0)
     _, first = np.unique(voxel_keys(coords).cpu().numpy(), return_index=True)
@@ -59,14 +61,14 @@ def _mean_by_distance(features: Tensor, coords: Tensor) -> Tensor:
     Features are (M, C), means (16 C,), C fastest. Voxels 56 m or more from the centroid are
     ignored; an empty sector has the mean 0.
     """
-    ends = torch.linspace(NEAR, FAR, SECTORS + 1, device=coords.device)[1:]
+    ends = torch.linspace(_NEAR, _FAR, _SECTORS + 1, device=coords.device)[1:]
     position = coords.float()
-    distance = (position - position.mean(0)).norm(dim=1) * VOXEL
-    sector = torch.bucketize(distance, ends, right=True)  # SECTORS beyond the last end
+    distance = (position - position.mean(0)).norm(dim=1) * _VOXEL
+    sector = torch.bucketize(distance, ends, right=True)  # _SECTORS beyond the last end
     # float64, for sums over tens of thousands of voxels.
     x = features.double()
-    total = x.new_zeros(SECTORS + 1, x.shape[1]).index_add_(0, sector, x)
-    count = torch.bincount(sector, minlength=SECTORS + 1).clamp(min=1)
+    total = x.new_zeros(_SECTORS + 1, x.shape[1]).index_add_(0, sector, x)
+    count = torch.bincount(sector, minlength=_SECTORS + 1).clamp(min=1)
     return (total / count[:, None])[:-1].to(features.dtype).flatten()
 
 
@@ -102,10 +104,10 @@ class MinkowskiNet(Extractor):
     layer = "last map of voxels, mean over 16 sectors of distance"
     has_points = False  #: whether there is a second branch, of points
 
-    def __init__(self, widths: Sequence[int] = WIDTHS, num_classes: int = 20) -> None:
+    def __init__(self, widths: Sequence[int] = _WIDTHS, num_classes: int = 20) -> None:
         super().__init__()
         c = widths
-        self.dim = SECTORS * c[8]
+        self.dim = _SECTORS * c[8]
         self.stem = nn.Sequential(*_step(4, c[0], 3), *_step(c[0], c[0], 3))
         for level in range(1, 5):
             above = c[level - 1]

@@ -77,7 +77,7 @@ PREDICTIONS = Registry(
 )
 
 # Expected data given (z, log-SNR), the latter of shape ()
-Denoise = Callable[[Tensor, Tensor], Tensor]
+_Denoise = Callable[[Tensor, Tensor], Tensor]
 
 
 def noised(x: Tensor, log_snr: Tensor, eps: Tensor) -> Tensor:
@@ -122,7 +122,7 @@ def _forward_step(z: Tensor, log_snr: Tensor, next_log_snr: Tensor, noise: Tenso
 
 
 def walk(
-    denoise: Denoise,
+    denoise: _Denoise,
     z: Tensor,
     log_snrs: Tensor,
     eta: float,
@@ -145,7 +145,7 @@ def walk(
 
 
 def repaint(
-    denoise: Denoise,
+    denoise: _Denoise,
     z: Tensor,
     image: Tensor,
     known: Tensor,

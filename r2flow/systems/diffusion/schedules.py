@@ -5,7 +5,6 @@ t.
 """
 
 import math
-from collections.abc import Callable
 from typing import Annotated
 
 import torch
@@ -14,9 +13,8 @@ from torch import Tensor
 from r2flow.base.errors import InputError
 from r2flow.base.registry import Bound, NonNegative, Positive, Registry
 
-LogSNR = Callable[[Tensor], Tensor]
-Steps = Annotated[int, Bound("at least 2", lambda n: n >= 2)]
-Beta = Annotated[float, Bound("in (0, 1)", lambda x: 0 < x < 1)]
+_Steps = Annotated[int, Bound("at least 2", lambda n: n >= 2)]
+_Beta = Annotated[float, Bound("in (0, 1)", lambda x: 0 < x < 1)]
 
 _FARTHEST = 20  # largest |lambda|: up to it, the float32 tangent has an error of at most 0.005
 
@@ -41,7 +39,7 @@ class _Cosine:
         return -2 * torch.tan(self.start + t * (self.end - self.start)).log()
 
 
-class Linear:
+class _Linear:
     """lambda(t) = -ln(e^(1e-4 + 10 t^2) - 1): beta grows linearly (Ho et al. 2020, continuous)."""
 
     def __call__(self, t: Tensor) -> Tensor:
@@ -88,7 +86,7 @@ def _of_steps(beta: Tensor) -> Tensor:
     return torch.logit((1 - beta).cumprod(0))
 
 
-def square_root_linear(first: Beta = 0.0015, last: Beta = 0.0195, steps: Steps = 1000) -> Tensor:
+def square_root_linear(first: _Beta = 0.0015, last: _Beta = 0.0195, steps: _Steps = 1000) -> Tensor:
     """lambda_t, (N,), of beta_t with evenly spaced square roots, as in LiDM (Ran et al. 2024)."""
     return _of_steps(torch.linspace(first**0.5, last**0.5, steps, dtype=torch.float64) ** 2)
 
@@ -98,7 +96,7 @@ def _linear_steps(steps: Annotated[int, Bound("above 20", lambda n: n > 20)] = 1
     return _of_steps(torch.linspace(0.1 / steps, 20 / steps, steps, dtype=torch.float64))
 
 
-def _cosine_steps(steps: Steps = 1000, offset: NonNegative = 0.008) -> Tensor:
+def _cosine_steps(steps: _Steps = 1000, offset: NonNegative = 0.008) -> Tensor:
     """lambda_t, (N,), of alpha_t ~ cos(pi / 2 (t / N + offset) / (1 + offset)).
 
     Nichol and Dhariwal 2021, eq. 17.
@@ -107,7 +105,7 @@ def _cosine_steps(steps: Steps = 1000, offset: NonNegative = 0.008) -> Tensor:
     return _of_signal(torch.cos((t + offset) / (1 + offset) * math.pi / 2).square())
 
 
-def _sigmoid_steps(steps: Steps = 1000, start: float = -3.0, end: float = 3.0) -> Tensor:
+def _sigmoid_steps(steps: _Steps = 1000, start: float = -3.0, end: float = 3.0) -> Tensor:
     """lambda_t, (N,), of alpha_t^2 ~ sigmoid(end) - sigmoid(start + (end - start) t / N), 1 at t =
     0.
 
@@ -126,7 +124,7 @@ def _of_signal(alpha_squared: Tensor) -> Tensor:
 SCHEDULES = Registry(
     "log-SNR schedule",
     cosine=_Cosine,
-    linear=Linear,
+    linear=_Linear,
     cosine_shifted=_CosineShifted,
     cosine_interpolated=_CosineInterpolated,
 )

@@ -53,7 +53,7 @@ def _flip(source: BatchDraws) -> Tensor:
 _Magnitudes = dict[str, Callable[[BatchDraws], Tensor]]
 
 # Magnitudes for a batch, in the order of drawing and application.
-GEOMETRY: _Magnitudes = {
+_GEOMETRY: _Magnitudes = {
     "lr_flip": _flip,
     "ud_flip": _flip,
     "int_trans": lambda source: (source.uniform(2).mT - 0.5) / 4,  # relative to the size
@@ -61,12 +61,12 @@ GEOMETRY: _Magnitudes = {
     "frac_trans": lambda source: 0.125 * source.normal(2).mT,
 }
 # The published hue and saturation do not affect images of one or two channels.
-COLOUR: _Magnitudes = {
+_COLOUR: _Magnitudes = {
     "brightness": lambda source: 0.2 * source.normal(),
     "contrast": lambda source: torch.exp2(0.5 * source.normal()),
     "luma_flip": _flip,
 }
-TRANSFORMATIONS = GEOMETRY | COLOUR
+TRANSFORMATIONS = _GEOMETRY | _COLOUR
 
 
 class AdaptiveAugment(nn.Module):
@@ -139,7 +139,7 @@ def _applied(draws: Draws, name: str, identity: float) -> Tensor:
 
 
 def affine(draws: Draws, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Scale and shift of pixels about the image centre by all of `GEOMETRY`, (2, B) each.
+    """Scale and shift of pixels about the image centre by all of `_GEOMETRY`, (2, B) each.
 
     Rows are before columns. Only rows are scaled, since a scale of columns would open the ring.
     """
@@ -194,7 +194,7 @@ def _row(lines: Tensor, index: Tensor) -> Tensor:
 
 
 def _coloured(x: Tensor, draws: Draws) -> Tensor:
-    """Apply all of `COLOUR` to x of one channel; two are left alone, as in the published code."""
+    """Apply all of `_COLOUR` to x of one channel; two are left alone, as in the published code."""
     if x.shape[1] != 1:
         return x
     identities = {"brightness": 0.0, "contrast": 1.0, "luma_flip": 0.0}

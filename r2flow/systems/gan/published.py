@@ -10,7 +10,7 @@ from r2flow.base.registry import Options
 from r2flow.model.published import Format, Published, has_keys, sensor_of
 from r2flow.systems.gan.layers import DROPPED
 
-GENERATORS = {"vanilla": "vanilla_gan", "dusty_v1": "dusty1", "dusty_v2": "dusty2"}
+_GENERATORS = {"vanilla": "vanilla_gan", "dusty_v1": "dusty1", "dusty_v2": "dusty2"}
 _TANH = {None: False, "nn.Tanh": True}
 # Options that would change images, but no weight's shape; the published files have these.
 _FORM = {
@@ -55,7 +55,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
 
 
 def _generator(model: Options) -> dict[str, Any]:
-    name = GENERATORS[str(model["arch"])]
+    name = _GENERATORS[str(model["arch"])]
     mapping = model["mapping_kwargs"]
     synthesis = model["synthesis_kwargs"]
     options = {

@@ -8,6 +8,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -202,7 +203,7 @@ class Autoencoder(nn.Module):
         super().__init__()
         levels = len(multipliers)
         widths = [width * n for n in multipliers]
-        self.strides = [tuple(stride) for stride in strides]
+        self.strides: list[Any] = [tuple(stride) for stride in strides]
         if len(strides) != levels - 1 or not UP.keys() >= set(self.strides):
             raise InputError(
                 f"an autoencoder of {levels} levels needs {levels - 1} strides, each [1, 2] or "

@@ -23,13 +23,15 @@ from r2flow.lidar.encoding import ModelSpace
 from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
 from r2flow.systems.score.refinenet import RefineNet
 
-Score = Callable[[Tensor, Tensor], Tensor]
+_Score = Callable[[Tensor, Tensor], Tensor]
 """s(x, i): images (B, C, H, W) and their noise-level indices, (B,) int64, to (B, C, H, W)."""
 
-Spacing = Literal["geometric", "uniform"]
+_Spacing = Literal["geometric", "uniform"]
 
 
-def _noise_levels(first: float, last: float, levels: int, spacing: Spacing = "geometric") -> Tensor:
+def _noise_levels(
+    first: float, last: float, levels: int, spacing: _Spacing = "geometric"
+) -> Tensor:
     """sigma_0 = first > ... > sigma_{L-1} = last, (levels,) float32."""
     if last > first:
         raise InputError(f"noise levels fall from {first:g} and cannot reach {last:g}.")
@@ -43,7 +45,7 @@ def _step_sizes(sigmas: Tensor, rate: float) -> Tensor:
 
 
 def score_loss(
-    score: Score, x: Tensor, noise: Tensor, labels: Tensor, sigmas: Tensor, power: float = 2.0
+    score: _Score, x: Tensor, noise: Tensor, labels: Tensor, sigmas: Tensor, power: float = 2.0
 ) -> Tensor:
     """Denoising score matching, sigma^power / 2 |s(x + sigma n, i) + n / sigma|^2, (B,).
 
@@ -56,7 +58,7 @@ def score_loss(
 
 
 def _annealed_langevin(
-    score: Score,
+    score: _Score,
     x: Tensor,
     sigmas: Tensor,
     noise: Callable[[int], Tensor],
@@ -112,7 +114,7 @@ class ScoreModel(Generator):
         sigma_first: Positive = 50.0,
         sigma_last: Positive = 0.01,
         levels: Count = 232,
-        spacing: Spacing = "geometric",
+        spacing: _Spacing = "geometric",
     ) -> None:
         super().__init__(space)
         self.run_by(Langevin())
