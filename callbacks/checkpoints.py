@@ -11,7 +11,7 @@ from lightning.pytorch.callbacks import Checkpoint
 
 from r2flow.base.errors import InputError
 from r2flow.base.files import atomic_write
-from r2flow.base.registry import Count
+from r2flow.base.registry import Config, Count
 from r2flow.model.paths import FOLDER, checkpoints_of, step_of
 from r2flow.model.tensor_files import read_checkpoint
 
@@ -23,7 +23,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
     def save_checkpoint(
         self,
-        checkpoint: dict[str, Any],
+        checkpoint: Config,
         path: str | os.PathLike[str],
         storage_options: Any | None = None,
     ) -> None:
@@ -45,7 +45,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
     def load_checkpoint(
         self, path: Any, map_location: Any = "cpu", weights_only: bool | None = None
-    ) -> dict[str, Any]:
+    ) -> Config:
         # On the CPU, as in Lightning, so that a run can resume without the GPU that it started on.
         checkpoint = read_checkpoint(path, map_location or "cpu")
         # Lightning's timer would resume with its time used up; trainer.max_time applies to each

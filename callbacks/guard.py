@@ -4,7 +4,7 @@ many.
 
 import logging
 import math
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import lightning as L
 import torch
@@ -118,10 +118,10 @@ class Guard(L.Callback):
             wait_for_launcher()
         raise InputError(message)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self):
         return {"in_a_row": self.in_a_row, "total": self.total}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+    def load_state_dict(self, state_dict):
         vars(self).update(state_dict)
 
 

@@ -5,7 +5,7 @@ MLFLOW_TRACKING_URI), never from a config, which the run's folder and its checkp
 """
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from lightning.pytorch.loggers import (
 )
 
 from r2flow.base.errors import InputError, one_line, require
-from r2flow.base.registry import Registry
+from r2flow.base.registry import Options, Registry
 
 _PROJECT = "r2flow"
 
@@ -101,7 +101,7 @@ def log_picture(loggers: Iterable[Logger], name: str, pixels: np.ndarray, step: 
             _PICTURES[type(logger)](logger, name, pixels, step)
 
 
-def log_config(loggers: Iterable[Logger], config: Mapping[str, Any]) -> None:
+def log_config(loggers: Iterable[Logger], config: Options) -> None:
     """Log a run's config to the loggers outside its folder."""
     for logger in loggers:
         try:

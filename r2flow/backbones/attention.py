@@ -22,7 +22,7 @@ from torch import Tensor
 
 from r2flow.backbones.layers import rows_at_once
 from r2flow.base.errors import InputError
-from r2flow.base.registry import Registry
+from r2flow.base.registry import Registry, Size
 
 # limit of torch.compile's graphs of flex_attention; three levels exceed its default of 8
 _GRAPHS = 64
@@ -35,7 +35,7 @@ def neighbourhood_attention(
     q: Tensor,
     k: Tensor,
     v: Tensor,
-    window: tuple[int, int],
+    window: Size,
     wrap: bool = True,
     backend: str = "auto",
 ) -> Tensor:

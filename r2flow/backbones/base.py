@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from r2flow.backbones.layers import ExactBuffers, at_least_float32
 from r2flow.base.errors import InputError
-from r2flow.base.registry import Positive
+from r2flow.base.registry import Positive, Size
 
 Prediction = Literal["velocity", "data", "noise"]
 
@@ -57,7 +57,7 @@ class Backbone(ExactBuffers):
     def __init__(
         self,
         rays: Tensor,
-        unit: tuple[int, int] = (1, 1),
+        unit: Size = (1, 1),
         /,
         in_channels: int = 2,
         out_channels: int | None = None,

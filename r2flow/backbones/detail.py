@@ -5,6 +5,7 @@ from torch import Tensor, nn
 
 from r2flow.backbones.convolutions import RingConv2d
 from r2flow.backbones.layers import ExactLinear, RMSNorm, uncast, unshuffle, zero_initialised
+from r2flow.base.registry import Size
 
 
 class Detail(nn.Module):
@@ -22,7 +23,7 @@ class Detail(nn.Module):
         channels: int,
         ends: tuple[int, int],
         token_channels: int,
-        patch: tuple[int, int],
+        patch: Size,
         condition_channels: int,
         ring: bool,
     ) -> None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.backbones.layers import ExactBuffers
-from r2flow.base.registry import Registry
+from r2flow.base.registry import Registry, Size
 
 
 class Rotary(ExactBuffers):
@@ -20,7 +20,7 @@ class Rotary(ExactBuffers):
     4))) of an axis, with M its highest harmonic.
     """
 
-    def __init__(self, heads: int, head_channels: int, highest: tuple[int, int]) -> None:
+    def __init__(self, heads: int, head_channels: int, highest: Size) -> None:
         super().__init__()
 
         def frequencies(top: int) -> nn.Buffer:
@@ -50,14 +50,14 @@ class RayEncoding(ExactBuffers):
 
     channels: int
 
-    def __init__(self, shape: tuple[int, int]) -> None:
+    def __init__(self, shape: Size) -> None:
         super().__init__()
 
 
 class FourierFeatures(RayEncoding):
     """sin and cos of 2^k e and 2^k a, for k = 0 .. ceil(log2 n) - 1 on an axis of n pixels."""
 
-    def __init__(self, shape: tuple[int, int]) -> None:
+    def __init__(self, shape: Size) -> None:
         super().__init__(shape)
         ladders = (2.0 ** torch.arange(math.ceil(math.log2(size)))[:, None] for size in shape)
         freqs = torch.block_diag(*ladders)

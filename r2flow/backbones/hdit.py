@@ -177,7 +177,7 @@ def time_embedding(channels: int, dropout: float) -> nn.Sequential:
 
 
 def _position(
-    position: str | None, tokens: tuple[int, int], channels: int, dropout: float
+    position: str | None, tokens: Size, channels: int, dropout: float
 ) -> nn.Module | None:
     name = position_name(position, "learnable", "none")
     if name == "none":
@@ -193,7 +193,7 @@ def _position(
 class _LearnablePosition(nn.Module):
     """A learned vector added to each token: the absolute position embedding of the paper."""
 
-    def __init__(self, tokens: tuple[int, int], channels: int) -> None:
+    def __init__(self, tokens: Size, channels: int) -> None:
         super().__init__()
         vectors = nn.init.trunc_normal_(torch.empty(1, *tokens, channels), std=0.02)
         self.embedding = nn.Parameter(vectors)

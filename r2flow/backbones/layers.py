@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.base.errors import InputError
+from r2flow.base.registry import Size
 
 _Layer = TypeVar("_Layer", bound=nn.Module)
 
@@ -161,7 +162,7 @@ def wrapped(x: Tensor, left: int, right: int) -> Tensor:
     return torch.cat([last, first, inner, last, first], dim=3)
 
 
-def unshuffle(x: Tensor, patch: tuple[int, int]) -> Tensor:
+def unshuffle(x: Tensor, patch: Size) -> Tensor:
     """(B, H, W, p q C) to (B, H p, W q, C)."""
     return x.unflatten(3, (*patch, -1)).permute(0, 1, 3, 2, 4, 5).flatten(3, 4).flatten(1, 2)
 
@@ -188,7 +189,7 @@ def in_bands(f: Callable[..., tuple[Tensor, ...]], *maps: Tensor) -> tuple[Tenso
     return tuple(torch.cat(outputs, dim=1) for outputs in zip(*parts, strict=True))
 
 
-def halved(what: str, shape: Sequence[int], times: int, least: int = 1) -> tuple[int, int]:
+def halved(what: str, shape: Sequence[int], times: int, least: int = 1) -> Size:
     """Rows and columns of an image after `times` halvings, at least `least`.
 
     Raises:

@@ -18,10 +18,11 @@ from r2flow.backbones.layers import (
     zero_initialised,
 )
 from r2flow.base.errors import InputError
+from r2flow.base.registry import Size
 
 
 class Neighbourhood(NamedTuple):
-    window: tuple[int, int]
+    window: Size
     ring: bool
     backend: str
 
@@ -30,7 +31,7 @@ class BlockOptions(NamedTuple):
     channels: int
     heads: int
     condition_channels: int
-    highest: tuple[int, int]  # harmonics of the rotation in elevation and azimuth
+    highest: Size  # harmonics of the rotation in elevation and azimuth
     neighbourhood: Neighbourhood | None  # window of attention; None: all tokens
     dropout: float
 

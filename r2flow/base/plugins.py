@@ -12,16 +12,15 @@ import argparse
 import importlib
 import importlib.util
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from hashlib import sha256
 from importlib.metadata import entry_points
 from pathlib import Path
 from traceback import walk_tb
-from typing import Any
 
 from r2flow.base.errors import InputError, check
-from r2flow.base.registry import Registry, UnknownName
+from r2flow.base.registry import Options, Registry, UnknownName
 
 GROUP = "r2flow.plugins"
 
@@ -114,7 +113,7 @@ Registry.on_missing.append(load_installed)
 
 
 @contextmanager
-def made_with(config: Mapping[str, Any], what: str) -> Iterator[None]:
+def made_with(config: Options, what: str) -> Iterator[None]:
     """Add the plug-ins that may define an unknown name of a stored config to the error; `what` is
     its owner.
     """

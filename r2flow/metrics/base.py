@@ -12,6 +12,7 @@ from torchmetrics import Metric
 
 from r2flow.base.errors import InputError
 from r2flow.base.processes import rank_and_world_size
+from r2flow.base.registry import Options
 from r2flow.lidar.sensors import Sensor, named_sensor
 from r2flow.metrics.scans import MASK, Scans
 
@@ -30,7 +31,7 @@ class Protocol:
     extractor: str | None = None  #: name of the network; None without a network
     weights: str | None = None  #: first 12 digits of the SHA-256 of its weights
     layer: str | None = None  #: its feature layer
-    settings: Mapping[str, Any] = field(default_factory=dict)  #: bins, bandwidth, neighbours
+    settings: Options = field(default_factory=dict)  #: bins, bandwidth, neighbours
 
 
 def blocks(rows: Tensor) -> Iterator[tuple[slice, Tensor]]:
@@ -64,7 +65,7 @@ class ScanMetric(Metric):
     name: str
     representation: str
     mask = MASK
-    settings: ClassVar[Mapping[str, Any]] = {}
+    settings: ClassVar[Options] = {}
     needs_reflectance: bool = False  #: whether scans without reflectance are refused
     uses_reflectance: bool = False  #: whether reflectance is used if present
     #: Whether the first value, a distance that is 0 for equal sets, is larger for fewer scans; an

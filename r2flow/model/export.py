@@ -23,7 +23,7 @@ from r2flow import __version__
 from r2flow.base.errors import InputError, require
 from r2flow.base.files import write_file
 from r2flow.base.noise import Draws
-from r2flow.base.registry import Registry
+from r2flow.base.registry import Config, Registry
 from r2flow.generators import USUAL, RectifiedFlow, Sampler
 from r2flow.lidar.encoding import ModelSpace
 from r2flow.lidar.projection import unproject
@@ -138,7 +138,7 @@ def _weighted_sum(row: list[float], vectors: list[Tensor]) -> Tensor:
 
 class Exported(NamedTuple):
     path: Path
-    notes: dict[str, Any]  # metadata
+    notes: Config  # metadata
 
 
 def export(
@@ -187,7 +187,7 @@ def export(
     return Exported(path, notes)
 
 
-def _notes(checkpoint: Checkpoint, how: Sampler, steps: Tableau | None) -> dict[str, Any]:
+def _notes(checkpoint: Checkpoint, how: Sampler, steps: Tableau | None) -> Config:
     space = checkpoint.generator.space
     notes = {
         "r2flow": __version__,
@@ -211,7 +211,7 @@ def _notes(checkpoint: Checkpoint, how: Sampler, steps: Tableau | None) -> dict[
     }
 
 
-def _write_pt2(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) -> bytes:
+def _write_pt2(flow: RectifiedFlow, how: Tableau | None, notes: Config) -> bytes:
     if how is None:
         program = _traced(flow.backbone, *_network_inputs(flow, (2,)))
     else:
@@ -221,7 +221,7 @@ def _write_pt2(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) 
     return file.getvalue()
 
 
-def _write_onnx(flow: RectifiedFlow, how: Tableau | None, notes: dict[str, Any]) -> bytes:
+def _write_onnx(flow: RectifiedFlow, how: Tableau | None, notes: Config) -> bytes:
     from r2flow.model.onnx_graphs import sampler_graph, to_onnx
 
     inputs = _network_inputs(flow, (2,) if how is None else ())

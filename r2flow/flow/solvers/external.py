@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.base.registry import Registry
+from r2flow.base.registry import Config, Registry
 from r2flow.flow.solvers.adaptive import attainable
 from r2flow.flow.solvers.solution import Evaluations, Solution, Spent, finite
 
@@ -58,7 +58,7 @@ class TorchDiffEqMethod:
             # From the state's type, since the velocity has not been evaluated yet.
             tolerance = attainable(v.limits, v.coarsest(x))
             # Without it, the last step passes the end, and the state there is interpolated.
-            options: dict[str, Any] = {"step_t": grid[-1:]}
+            options: Config = {"step_t": grid[-1:]}
         else:
             tolerance = v.limits.tolerance
             options = {"grid_constructor": lambda field, start, span: grid}

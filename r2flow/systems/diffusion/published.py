@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from r2flow.base.errors import InputError
-from r2flow.base.registry import Options
+from r2flow.base.registry import Config, Options
 from r2flow.model.published import BACKBONE, Format, Published, has_keys, rings_of
 from r2flow.model.published import published_config as flow_config
 
@@ -28,7 +28,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     return Published(config, weights, step, sampler, rings_of(config, weights))
 
 
-def published_config(cfg: Options) -> dict[str, Any]:
+def published_config(cfg: Options) -> Config:
     """Convert a published checkpoint's `cfg` (data, model, diffusion, training) to our config."""
     diffusion = cfg["diffusion"]
     if diffusion["timestep_type"] != "continuous" or not cfg["data"]["train_depth"]:

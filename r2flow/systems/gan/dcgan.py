@@ -8,7 +8,7 @@ from itertools import pairwise
 from torch import nn
 
 from r2flow.backbones.layers import halved
-from r2flow.base.registry import Count, Options, Positive
+from r2flow.base.registry import Count, Options, Positive, Size
 from r2flow.lidar.encoding import ModelSpace
 from r2flow.systems.gan.generator import Gan
 from r2flow.systems.gan.layers import (
@@ -94,7 +94,7 @@ class Discriminator(nn.Sequential):
 
     def __init__(
         self,
-        shape: tuple[int, int],
+        shape: Size,
         channels: int = 1,
         base_channels: Count = 64,
         max_channels: Count = 512,

@@ -6,7 +6,7 @@ They have the entries cfg, step, angle, G, G_ema, D, ...
 from pathlib import Path
 from typing import Any
 
-from r2flow.base.registry import Options
+from r2flow.base.registry import Config, Options
 from r2flow.model.published import Format, Published, has_keys, sensor_of
 from r2flow.systems.gan.layers import DROPPED
 
@@ -54,7 +54,7 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     return Published(config, weights, step, elevations=angle[0, 0].double().mean(1))
 
 
-def _generator(model: Options) -> dict[str, Any]:
+def _generator(model: Options) -> Config:
     name = _GENERATORS[str(model["arch"])]
     mapping = model["mapping_kwargs"]
     synthesis = model["synthesis_kwargs"]

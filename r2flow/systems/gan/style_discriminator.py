@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from r2flow.backbones.layers import at_least_float32, halved
-from r2flow.base.registry import Count
+from r2flow.base.registry import Count, Size
 from r2flow.systems.gan.layers import BiasedLeakyReLU, BlurBoth, Equalised, Filter, Pad
 
 
@@ -65,7 +65,7 @@ class Discriminator(nn.Module):
 
     def __init__(
         self,
-        shape: tuple[int, int],
+        shape: Size,
         channels: int = 1,
         base_channels: Count = 32,
         max_channels: Count = 512,

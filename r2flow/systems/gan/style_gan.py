@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from r2flow.backbones.convolutions import Resample
 from r2flow.backbones.layers import ExactBuffers, at_least_float32, halved
 from r2flow.base.processes import mean_over_processes
-from r2flow.base.registry import Count, Options, Positive
+from r2flow.base.registry import Count, Options, Positive, Size
 from r2flow.generators.base import Generator
 from r2flow.lidar.encoding import ModelSpace
 from r2flow.systems.gan.generator import Gan
@@ -40,7 +40,7 @@ class _RandomFrequencies(ExactBuffers):
     that features are periodic in azimuth. The level has H rows and W columns.
     """
 
-    def __init__(self, shape: tuple[int, int]) -> None:
+    def __init__(self, shape: Size) -> None:
         super().__init__()
         octaves_e, octaves_a = (math.ceil(math.log2(size)) for size in shape)
         elevation = (2 * torch.rand(_FREQUENCIES) - 1) * 2.0 ** (octaves_e + 2)
@@ -105,7 +105,7 @@ class _Level(nn.Module):
         channels: int,
         made: dict[str, int],
         code: int,
-        shape: tuple[int, int],
+        shape: Size,
     ) -> None:
         super().__init__()
         self.first = in_channels == 0
