@@ -85,11 +85,6 @@ def explain_mistake(error: InputError | OSError) -> str:
     if isinstance(error, OSError):
         if error.errno is None or isinstance(error, _BUGS):
             raise error
-        if error.errno in (errno.ENOTDIR, errno.EEXIST) and error.filename:
-            given = Path(os.fsdecode(error.filename))
-            for path in (given, *given.parents):
-                if path.exists() and not path.is_dir():
-                    return one_line(f"{path} is a file, not a folder; give another name.")
         where = f"{error.filename}: " if error.filename else ""
         return one_line(f"{where}{error.strerror or error}")
     text = str(error)

@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 from filelock import FileLock, Timeout
 
-from r2flow.base.config import at_most_three, check_tree, differences, flatten, is_free
+from r2flow.base.config import at_most_three, check_tree, differences, is_free
 from r2flow.base.errors import InputError, check
 from r2flow.base.files import write_file
 from r2flow.base.registry import Config, Options
@@ -102,7 +102,7 @@ def open_run(run: str | Path, config: Options, locked: bool = True) -> Path | No
             f"{run} has checkpoints without their {CONFIG}: give name=OTHER stage.parent={last}."
         )
     if old is not None and last is not None:
-        _refuse_another_config(run, old, config)
+        _refuse_another_config(run, contradictions(old, config))
         other = differences(old, config)
         samplers = [other[key] for key in other if key.startswith("sampler.")]
         if samplers and has_ended(run, last):
@@ -134,15 +134,12 @@ def check_run(run: str | Path, config: Options) -> None:
         "encoding.levels",
         "data.pairs.parent",
     )
-    there, here = (
-        {key: value for key, value in flatten(side) if not key.startswith(later)}
-        for side in (old, config)
-    )
-    _refuse_another_config(run, there, here, alone=False)
+    differing = [text for text in contradictions(old, config) if not text.startswith(later)]
+    _refuse_another_config(run, differing, alone=False)
 
 
-def _refuse_another_config(run: str | Path, old: Options, new: Options, alone: bool = True) -> None:
-    if differing := contradictions(old, new):
+def _refuse_another_config(run: str | Path, differing: Sequence[str], alone: bool = True) -> None:
+    if differing:
         more_steps = ""
         if alone and all(text.startswith("trainer.max_steps=") for text in differing):
             # Not the folder: the run may not be finished.
