@@ -241,7 +241,5 @@ def test_pairs_are_read_as_the_flow_that_draws_them_says(parent: Path):
     }
     there = parent_of(read, parent)
     assert {key: completed(config, [], there)["data"]["reading"][key] for key in read} == read
-    with pytest.raises(
-        InputError, match="data.reading is that of the flow that draws the pairs"
-    ):
+    with pytest.raises(InputError, match="data.reading is that of the flow that draws the pairs"):
         completed(config, ["data.reading.projection"], there)
