@@ -22,7 +22,13 @@ from r2flow.training import check
 from tests.conftest import CONFIG as BOTH
 from tests.conftest import SENSOR, write_checkpoint
 
-ENCODING = {"format": "logscale", "reflectance": False, "limits": "closed", "levels": None}
+ENCODING = {
+    "format": "logscale",
+    "reflectance": False,
+    "limits": "closed",
+    "levels": None,
+    "labels": False,
+}
 CONFIG = {**BOTH, "encoding": ENCODING, "backbone": {**BOTH["backbone"], "position": "none"}}
 
 
