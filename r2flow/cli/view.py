@@ -64,7 +64,7 @@ def show(
     }:
         raise InputError(f"{out} is the folder of the scans; give another --out.")
     names: set[str] = set()
-    readings = {spec: how.reading([spec], estimate_scale=True) for spec in scans}
+    readings = {spec: how.reading([spec], estimate=True) for spec in scans}
     for _, panel in scan_panels(share_scale(readings, most), most):
         stem = Path(panel.caption).stem
         versions = (stem if number == 1 else f"{stem}_{number}" for number in count(1))
@@ -136,7 +136,7 @@ def view(
     for spec in what:
         if spec not in models:
             model = None if describe(spec).stored else first
-            readings[spec] = how.reading([spec], model, estimate_scale=True)
+            readings[spec] = how.reading([spec], model, estimate=True)
     readings = share_scale(readings, num or _SCANS)
     drawn = [] if sequence else list(scan_panels(readings, num or _SCANS))
     panels = []
