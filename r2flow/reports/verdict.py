@@ -16,7 +16,7 @@ PRINTED = {
     "mmd": ("MMD x 10^4", 1e4),
     "kid_handcrafted": ("KID, hand-made features", 1.0),
     "frechet_handcrafted": ("Frechet distance, hand-made features", 1.0),
-    "evaluations": ("network calls a scan", 1.0),
+    "evaluations": ("network evaluations a scan", 1.0),
     "seconds": ("seconds a scan", 1.0),
 }
 
