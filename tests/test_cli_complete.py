@@ -445,7 +445,7 @@ def test_densify_keeps_all_beams_by_default(complete, tmp_path):
     """The model's own view, from +3 to -25 degrees, has 10 of a VLP-16's 16 beams."""
     sparse_scan(tmp_path / "room.pcd", steps=200)
     said = complete(tmp_path / "room.pcd", model=None).said
-    assert "16 of the 64 rows of mine are measured" in said
+    assert "16 of the 64 rows to complete are measured" in said
     assert "in their own view, as 64x1024, which keeps all their beams" in said
     answer = read_points(tmp_path / "out" / "room.pcd").xyz
     elevation = np.degrees(np.arcsin(answer[:, 2] / np.linalg.norm(answer, axis=1)))
@@ -457,7 +457,7 @@ def test_fewer_beams_than_rows_of_a_sensor_of_ones_own_are_found(complete, tmp_p
     sparse_scan(tmp_path / "room.pcd")
     write_sensor(replace(VLP16, name="mine"), tmp_path / "mine.yaml", "")
     asked = tmp_path / "room.pcd", "--to", tmp_path / "mine.yaml", "--size", "32x128"
-    assert "16 of the 32 rows of mine are measured" in complete(*asked, model=None).said
+    assert "16 of the 32 rows to complete are measured" in complete(*asked, model=None).said
     said = complete(*asked[:1], "--from", tmp_path / "mine.yaml", out=tmp_path / "other").said
     assert "6 of its 16 beams look past" in said
     assert (

@@ -254,9 +254,7 @@ def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -
             f"{target.row_edges[0]:+.1f} to "
             f"{target.row_edges[-1]:+.1f} degrees."
         )
-    measured = (
-        f"{len(set(rows[rows >= 0]))} of the {target.shape[0]} rows of {target.name} are measured"
-    )
+    measured = f"{len(set(rows[rows >= 0]))} of the {target.shape[0]} rows to complete are measured"
     few = turns and source.columns < FEWER * target.columns
     turn = f", in the columns that its {source.columns} rays a turn meet" if few else ""
     lines = [f"{spec}: {beams}; {measured}{turn}"]
