@@ -72,7 +72,7 @@ def test_fewer_samples_than_the_folder_has_are_told(r2flow, saved, tmp_path: Pat
 def test_pictures_of_one_command_have_one_scale(r2flow, tmp_path: Path, monkeypatch):
     drawn = []
     monkeypatch.setattr(
-        "r2flow.reports.pictures.scan_figure", lambda *_: drawn.append(_[-1]) or Figure()
+        "r2flow.reports.pictures.scan_figure", lambda *given: drawn.append(given[3]) or Figure()
     )
     for number, metres in enumerate((4, 40)):
         xyz, reflectance = image_to_points(np.full((2, 8, 64), metres, np.float32), SENSOR.rays())

@@ -66,7 +66,7 @@ def show(
     names: set[str] = set()
     readings = {spec: how.reading([spec], estimate=True) for spec in scans}
     panels = [panel for _, panel in scan_panels(share_scale(readings, most), most)]
-    view = STREET if fixed else view_of(*((panel.images[0], panel.rays) for panel in panels))
+    view = STREET if fixed else view_of(*((panel.images[0][:2], panel.rays) for panel in panels))
     for panel in panels:
         stem = Path(panel.caption).stem
         versions = (stem if number == 1 else f"{stem}_{number}" for number in count(1))

@@ -22,13 +22,15 @@ from r2flow.reports.pages import write_page
 from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.runs import read_runs
 from r2flow.reports.tables import Row, print_table, table
+from r2flow.samplers import FixedSteps
 
 _SCANS = 32  # of each set that is compared
 _STAGES = {"rectify": "trained on scans", "reflow": "straightened", "distill": "distilled"}
 _INCLUDED = f"{DEFAULT}, included in r2flow"
 _COLUMNS = {
     "scans": "scans",
-    "calls": "network evaluations a scan",
+    "solver": "solver",
+    "calls": "evaluations",
     "seconds": "seconds a scan",
     "distance": "distance",
 }
@@ -48,7 +50,7 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
     about, rows = _with_distances(drawn, first)
     page = compare_page({run.label: [run] for run in read_runs(list(runs.values()))})
     page = replace(page, text=[about, table(rows, _COLUMNS), *page.text])
-    titles = [f"{row['scans']}, {row['calls']:g} network evaluations" for row, _ in drawn]
+    titles = [f"{row['scans']}, {row['solver']}, {row['calls']:g} evaluations" for row, _ in drawn]
     page.figures["steps"] = contact_sheet([x[0] for _, x in drawn], last.sensor.rays(), titles)
     write_samples(last, out, num=4, seed=0, pictures=4, replace=True)
     *_, text = write_page(page, out)
@@ -83,7 +85,8 @@ def _samplers(generator: Generator) -> list[Sampler]:
     own = generator.sampler
     if generator.fixed or not hasattr(own, "steps"):
         return [own]
-    return [generator.choose(steps=1), generator.choose(steps=2), own]
+    few = "euler" if isinstance(own, FixedSteps) else None  # as distilled flows take them
+    return [generator.choose(few, steps=1), generator.choose(few, steps=2), own]
 
 
 def _draw(model: Checkpoint, label: str, sampler: Sampler) -> tuple[Row, ndarray]:
@@ -91,6 +94,7 @@ def _draw(model: Checkpoint, label: str, sampler: Sampler) -> tuple[Row, ndarray
     calls = [batch.evaluations.float().mean().item() for batch in batches]
     row = {
         "scans": label,
+        "solver": sampler.name,
         "calls": float(np.mean(calls)),
         "seconds": sum(batch.seconds for batch in batches) / _SCANS,
     }
@@ -122,11 +126,11 @@ def _with_distances(
     best, name = min((distance(scans[:].numpy()), name) for name, scans in baselines)
     about = (
         f"Distance of {_SCANS} scans of each to {len(held_out)} held-out scans "
-        "(0: equal statistics)"
+        "(0: equal statistics); evaluations: runs of the network a scan"
     )
     return about, [
         *({**row, "distance": distance(images)} for row, images in drawn),
-        {"scans": "scans of the training", "distance": distance(trained[:].numpy())},
+        {"scans": "training scans", "distance": distance(trained[:].numpy())},
         {"scans": f"best baseline: {name}", "distance": best},
     ]
 
