@@ -50,7 +50,7 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
     about, rows = _with_distances(drawn, first)
     page = compare_page({run.label: [run] for run in read_runs(list(runs.values()))})
     page = replace(page, text=[about, table(rows, _COLUMNS), *page.text])
-    titles = [f"{row['scans']}, {row['solver']}, {row['calls']:g} evaluations" for row, _ in drawn]
+    titles = [f"{row['scans']}, {row['solver']}, evaluations: {row['calls']:g}" for row, _ in drawn]
     page.figures["steps"] = contact_sheet([x[0] for _, x in drawn], last.sensor.rays(), titles)
     write_samples(last, out, num=4, seed=0, pictures=4, replace=True)
     *_, text = write_page(page, out)
