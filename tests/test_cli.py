@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch.distributed.run
+from matplotlib.figure import Figure
 
 from r2flow import load
 from r2flow.base.errors import InputError
@@ -60,6 +61,29 @@ def test_sample_writes_the_same_scans_for_the_same_seed(r2flow, saved, tmp_path)
     assert sorted(p.suffix for p in (tmp_path / "c").glob("00000*")) == [".npy"] * 3 + [".png"] * 3
 
 
+def test_fewer_samples_than_the_folder_has_are_told(r2flow, saved, tmp_path: Path):
+    said = [
+        r2flow("sample", saved[0], "--num", num, "--pictures", 0, "--steps", 1, "-o", tmp_path).said
+        for num in (3, 1, 3)
+    ]
+    assert [", next to 2 of an earlier command" in one for one in said] == [False, True, False]
+
+
+def test_pictures_of_one_command_have_one_scale(r2flow, tmp_path: Path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        "r2flow.reports.pictures.scan_figure", lambda *given: drawn.append(given[3]) or Figure()
+    )
+    for number, metres in enumerate((4, 40)):
+        xyz, reflectance = image_to_points(np.full((2, 8, 64), metres, np.float32), SENSOR.rays())
+        write_points(tmp_path / f"{number}.ply", xyz, reflectance * 0)
+    r2flow(
+        "show", tmp_path / "0.ply", tmp_path / "1.ply", "--sensor", "hdl64e", "-o", tmp_path / "out"
+    )
+    assert drawn[0] == drawn[1]
+    assert drawn[0].ranges == pytest.approx((0.9 * 4, 1.1 * 40))
+
+
 def test_pictures_of_files_of_one_name_have_names_of_their_own(r2flow, tmp_path):
     files = [
         tmp_path / drive / "velodyne_points" / "data" / "000000.bin" for drive in ("d1", "d2", "d3")
@@ -73,8 +97,10 @@ def test_pictures_of_files_of_one_name_have_names_of_their_own(r2flow, tmp_path)
 
 def test_info_says_what_is_in_a_checkpoint(r2flow, saved):
     said = r2flow("info", saved[0]).said
-    for words in ("hdit", "[2, 8, 64]", "hdl64e", "logscale", "config.backbone.base_channels"):
+    for words in ("hdit", "[2, 8, 64]", "hdl64e", "name adams3, steps 16"):
         assert words in said
+    assert len(said.splitlines()) < 16
+    assert "config.backbone.base_channels" in r2flow("info", saved[0], "--all").said
     assert json.loads(r2flow("info", saved[0], "--json").said)["step"] == 7
 
 
@@ -204,7 +230,7 @@ def test_interpolate_writes_every_frame(r2flow, run, tmp_path):
     for path, image in zip(files, scans(2).numpy(), strict=True):
         write_points(path, *image_to_points(image, SENSOR.rays()))
     said = r2flow(
-        "interpolate", *files, "-c", run, "-o", out, "--frames", 4, "--sampler", "rk4", "--steps", 8
+        "interpolate", run, *files, "-o", out, "--frames", 4, "--sampler", "rk4", "--steps", 8
     ).said
     assert [path.name for path in sorted((out / "frames").glob("*.ply"))] == [
         f"{i:03d}.ply" for i in range(4)
@@ -217,7 +243,7 @@ def test_interpolate_writes_every_frame(r2flow, run, tmp_path):
     assert [row["weight"] for row in rows] == pytest.approx([0, 1 / 3, 2 / 3, 1])
     assert [row["evaluations"] for row in rows] == [64, 32, 32, 64]  # the ends go there and back
     assert "4 scans" in said
-    assert r2flow("interpolate", *files, "-c", run, "-o", out, "--frames", 3, "--steps", 5).said
+    assert r2flow("interpolate", run, *files, "-o", out, "--frames", 3, "--steps", 5).said
     rows = json.loads((out / "interpolation.json").read_text())["rows"]
     assert [row["evaluations"] for row in rows] == [10, 5, 10]  # of adams3, one a step
 

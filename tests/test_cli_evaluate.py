@@ -245,10 +245,10 @@ def test_a_distilled_model_keeps_its_steps(points, r2flow, real, tmp_path):
     assert [row["evaluations"] for row in points(td, "--steps", "1,2,4")[0]] == [2]
     warned = r2flow("evaluate", real, td, "--num", 2, *QUICK, "--sampler", "heun2")[2]
     assert "td.safetensors is distilled for euler, 2 steps alone" in warned
-    for verb in ("report curvature", "report solvers", f"interpolate {real} {real} -c"):
+    for verb, *scans in (["report curvature"], ["report solvers"], ["interpolate", real, real]):
         assert (
             "needs all times; this flow is distilled for euler"
-            in r2flow(*verb.split(), td, "-o", "a.html").refusal
+            in r2flow(*verb.split(), td, *scans, "-o", "a.html").refusal
         )
     assert (
         "figure_7.png"

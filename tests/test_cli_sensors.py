@@ -122,6 +122,27 @@ def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, t
             package.read(wrong)
 
 
+def test_pictures_of_an_unknown_sensor_are_of_its_own_beams(r2flow, scans: Path, tmp_path: Path):
+    code, _, error = r2flow("show", scans, "--num", 1, "--format", "npy", "--out", tmp_path / "out")
+    assert (code, len(error.splitlines())) == (0, 1), error
+    assert "no built-in sensor fits; read by its own 8 beams from +12.0 to -20.0" in error
+    (image,) = map(np.load, (tmp_path / "out").glob("*.npy"))
+    assert image.shape == (2, 8, 128)
+    # All of `write_scans` but a tenth, in the rows that see the ground or the wall.
+    assert (image[0] > 0).mean() == pytest.approx(0.9, abs=0.03)
+
+
+@pytest.mark.parametrize("verb", ["show", "sensor", "complete"])
+def test_two_sensors_in_one_folder_are_named(r2flow, scans: Path, tmp_path: Path, verb: str):
+    other = write_scans(tmp_path / "other", SENSORS["vlp16"].resized(columns=384), 1, 1)
+    shutil.copy(other / "000000.bin", scans / "000003.bin")
+    options = () if verb == "sensor" else ("--out", tmp_path / "out")
+    _, _, error = r2flow(verb, scans, *options)
+    (line,) = [one for one in error.splitlines() if "are of two" in one]
+    assert f"{scans / '000000.bin'} (8 beams from +12.0 to -20.0 degrees) and" in line
+    assert f"{scans / '000003.bin'} (16 beams from +15.0 to -15.0 degrees) are of two" in line
+
+
 def test_a_thinned_scan_is_not_taken_for_another_sensors(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):

@@ -339,7 +339,7 @@ def test_the_verdict_follows_from_reference_and_baselines(metric, real, scans, v
 
 @pytest.mark.parametrize(
     ("noise", "said"),
-    [(9.0, ["jsd ranks nothing here, with baselines below the real halves: noise."]), (11.0, [])],
+    [(9.0, ["do not rank by jsd here: baselines are below the real halves: noise."]), (11.0, [])],
 )
 def test_a_figure_by_which_a_baseline_is_nearer_than_real_scans_ranks_nothing(noise, said):
     cases = ("a", 7.0, "judged"), ("real halves", 10.0, "reference"), ("noise", noise, "baseline")

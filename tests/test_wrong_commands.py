@@ -60,10 +60,10 @@ view scans -o file.txt/a.html
 simulate -o out --size 1x1 # found 1
 simulate -o out --format npy --labels
 simulate -o scans --num 1 --size 8x64 # holds scans
-interpolate scans/000000.bin bad.bin -c run -o out
-interpolate scans scans -c run -o out # scan
+interpolate run scans/000000.bin bad.bin -o out
+interpolate run scans scans -o out # scan
 show file.txt -o out
-show scans -o out --projection unfolding
+show scans -o out --projection unfolding --sensor hdl64e
 show run -o out # a run without samples
 show street -o out # sample it first: r2flow sample street --out scans
 show nope:scans -o out
@@ -89,7 +89,7 @@ BASES = {
     "sample": "sample run -o out", "pairs": "pairs run --num 1", "simulate": "simulate -o out",
     "complete": "complete scans/000000.bin -c run -o out", "view": "view scans run -o out.html",
     "show": "show scans -o out",
-    "interpolate": "interpolate scans/000000.bin scans/000001.bin -c run -o out", "sensor": "sensor scans",
+    "interpolate": "interpolate run scans/000000.bin scans/000001.bin -o out", "sensor": "sensor scans",
     "prepare": "prepare scans -o out", "evaluate": "evaluate scans run --metrics jsd", "compare": "compare run",
     "curvature": "report curvature run -o out", "solvers": "report solvers -o out",
     "backbones": "report backbones", "paper": "report paper run -o out",

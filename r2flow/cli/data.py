@@ -153,6 +153,7 @@ def sensor(
             name = f"my_{name}"
     paths = [points_beside(path) for scan in scans for path in list_scans(scan, most)[0]]
     points = [read_points(path, columns) for path in track(paths, "reading", "scans", least=16)]
+    warn_of_frame(dict(zip(paths, points, strict=True)))
     mine, beams, steps, off, ground = estimate_sensor(points, name)
     degrees = mine.elevations
     nearest, distance = nearest_sensor(beams.elevations)
@@ -174,7 +175,6 @@ def sensor(
         "reflectance": reflectance,
     }
     print_table(list(rows.items()), ("", ""))
-    warn_of_frame(paths[0], points)
     if out is not None:
         write_sensor(mine, out, f"Estimated from {len(points)} scan(s), stored {beams.order}.")
         print(out)

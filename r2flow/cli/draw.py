@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from typer import Argument, Option
@@ -16,6 +15,7 @@ from r2flow.cli.options import (
     ColumnsOption,
     DeviceOption,
     DrawOptions,
+    ModelArgument,
     OutOption,
     PrecisionOption,
     SamplerOptions,
@@ -119,7 +119,9 @@ def sample(
         precision=precision,
         labels=labeller,
     )
-    print(f"{several(draw.num)} ({', '.join(formats)}) in {out}")
+    there = len(list(out.glob(f"[0-9]*.{formats[0]}")))
+    more = f", next to {there - draw.num} of an earlier command" if there > draw.num else ""
+    print(f"{several(draw.num)} ({', '.join(formats)}) in {out}{more}")
     if pictures:
         print(f"pictures in {out / 'samples.png'}, in 3-D in {out / 'samples.html'}")
 
@@ -144,16 +146,13 @@ def _region(checkpoint: "Checkpoint", sector: Any, rows: Any) -> "Region":
 
 @app.command(
     rich_help_panel="Draw",
-    epilog="Example: r2flow interpolate 100.bin 250.bin -c runs/NAME --frames 6 --out between",
+    epilog="Example: r2flow interpolate runs/NAME 100.bin 250.bin --frames 6 --out between",
 )
 @grouped
 def interpolate(
+    model: ModelArgument,
     first: Annotated[str, Argument(help="A scan file or a range image (.npy).")],
     last: Annotated[str, Argument(help="A second scan file or range image.")],
-    checkpoint: Annotated[
-        Path,
-        Option("--checkpoint", "-c", help="A checkpoint file, a run folder or a model."),
-    ],
     out: OutOption,
     sampling: SamplerOptions,
     frames: Annotated[int, Option(min=2, help="Number of scans, both ends included.")] = 6,
@@ -171,7 +170,7 @@ def interpolate(
     from r2flow.reports.pages import write_page
     from r2flow.samplers import Adaptive, build_sampler
 
-    loaded = load_checkpoint(checkpoint, choose_device(device))
+    loaded = load_checkpoint(model, choose_device(device))
     flow = as_flow(loaded.generator, "interpolation")
     given = sampling.given
     if "name" in given:

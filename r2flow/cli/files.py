@@ -12,6 +12,8 @@ from r2flow.base.errors import InputError, check_folder
 from r2flow.cli.app import app
 from r2flow.cli.options import ModelArgument, SamplerOptions, grouped
 
+_LABELS = {"few": "in fewer steps"}  # of `info`
+
 
 @app.command(
     rich_help_panel="Files",
@@ -88,7 +90,8 @@ def info(
             help="A checkpoint file, a run folder or a model. Default: list models and networks."
         ),
     ] = None,
-    json: Annotated[bool, Option("--json", help="Print JSON.")] = False,
+    json: Annotated[bool, Option("--json", help="Print JSON, with the whole config.")] = False,
+    everything: Annotated[bool, Option("--all", help="Print the whole config, too.")] = False,
     add: Annotated[
         tuple[str, Path] | None,
         Option(metavar="NAME FILE", help="Install a feature network from its file or folder."),
@@ -104,7 +107,7 @@ def info(
     from r2flow.metrics.extractors.base import add as install
     from r2flow.metrics.extractors.base import kept_file
     from r2flow.reports.contents import describe, print_known
-    from r2flow.reports.tables import print_table
+    from r2flow.reports.tables import print_table, words
 
     if add is not None:
         name, path = add
@@ -114,5 +117,13 @@ def info(
     elif json:
         print(to_json(describe(checkpoint), indent=2))
     else:
-        rows = [(key, str(value)) for key, value in flatten(describe(checkpoint))]
+        about = describe(checkpoint)
+        config = about.pop("config")
+        rows = [
+            (_LABELS.get(key, key), words(x) if isinstance(x, dict) else str(x))
+            for key, x in about.items()
+            if x is not None
+        ]
+        if everything:
+            rows += [(key, str(value)) for key, value in flatten({"config": config})]
         print_table(rows, ("", ""))

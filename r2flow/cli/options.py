@@ -157,12 +157,16 @@ class ReadingOptions:
         self,
         specs: Sequence[str | None],
         model: "Checkpoint | None" = None,
-        estimate_scale: bool = False,
+        estimate: bool = False,
     ) -> "Reading":
-        """How the scans of some names become images, for a model if given."""
+        """How the scans of some names become images, for a model if given.
+
+        `estimate`: what the sensor's name does not tell, as for pictures.
+        """
         from r2flow.data.opening import reading_for
 
-        return reading_for(specs, model, estimate_scale=estimate_scale, **asdict(self))
+        how = asdict(self)
+        return reading_for(specs, model, estimate_scale=estimate, estimate_beams=estimate, **how)
 
 
 @dataclass(frozen=True)

@@ -325,8 +325,9 @@ def compare(
     ] = False,
 ) -> None:
     """Compare runs: loss, bend, parameters, cost."""
-    from r2flow.reports.compare import compare_page, group_runs, print_comparison, read_runs
+    from r2flow.reports.compare import compare_page, group_runs, print_comparison
     from r2flow.reports.pages import write_page
+    from r2flow.reports.runs import read_runs
 
     compared = read_runs(runs)
     groups = group_runs(compared) if group else {run.label: [run] for run in compared}

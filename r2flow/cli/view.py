@@ -47,7 +47,7 @@ def show(
         bool,
         Option(
             "--fixed",
-            help="One scale for all pictures, that of a street. Default: each scan's own.",
+            help="Colours and view of a street. Default: those that fit all scans of the command.",
         ),
     ] = False,
 ) -> None:
@@ -56,7 +56,7 @@ def show(
     """
     from r2flow.base.files import save_array
     from r2flow.data.opening import describe
-    from r2flow.reports.pictures import STREET, save_figure, scan_figure
+    from r2flow.reports.pictures import STREET, save_figure, scan_figure, view_of
     from r2flow.reports.view.panels import scan_panels, share_scale
 
     if format == "npy" and out.resolve() in {
@@ -64,8 +64,10 @@ def show(
     }:
         raise InputError(f"{out} is the folder of the scans; give another --out.")
     names: set[str] = set()
-    readings = {spec: how.reading([spec], estimate_scale=True) for spec in scans}
-    for _, panel in scan_panels(share_scale(readings, most), most):
+    readings = {spec: how.reading([spec], estimate=True) for spec in scans}
+    panels = [panel for _, panel in scan_panels(share_scale(readings, most), most)]
+    view = STREET if fixed else view_of(*((panel.images[0][:2], panel.rays) for panel in panels))
+    for panel in panels:
         stem = Path(panel.caption).stem
         versions = (stem if number == 1 else f"{stem}_{number}" for number in count(1))
         name = next(version for version in versions if version not in names)
@@ -74,7 +76,6 @@ def show(
         if format == "npy":
             save_array(path, panel.images[0])
         else:
-            view = STREET if fixed else None
             labels = None if panel.labels is None else panel.labels[0]
             figure = scan_figure(panel.images[0], panel.rays, panel.caption, view, labels)
             save_figure(figure, path)
@@ -136,7 +137,7 @@ def view(
     for spec in what:
         if spec not in models:
             model = None if describe(spec).stored else first
-            readings[spec] = how.reading([spec], model, estimate_scale=True)
+            readings[spec] = how.reading([spec], model, estimate=True)
     readings = share_scale(readings, num or _SCANS)
     drawn = [] if sequence else list(scan_panels(readings, num or _SCANS))
     panels = []

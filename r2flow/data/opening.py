@@ -10,6 +10,7 @@ files that `find_mine(root)` lists, or a subclass of `SourceKind`.
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,13 +28,17 @@ from r2flow.data.prepared import PreparedScans, read_prepared, refuse_other_imag
 from r2flow.data.reading import AUTO, Reading, lacks_reflectance
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import (
+    LOOKED_AT,
     ScanFiles,
     ScanSource,
     SimulatedScans,
     made_here,
     mismatch_of,
+    readable,
+    spread,
     warn_of_other_sensor,
 )
+from r2flow.lidar.estimation import estimate_sensor, in_words
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensors import SENSORS, Sensor, named_sensor
 from r2flow.model.shipped import MODELS
@@ -329,6 +334,7 @@ def reading_for(
     sensor: Sensor | str | None = None,
     size: tuple[int, int] | None = None,
     estimate_scale: bool = False,
+    estimate_beams: bool = False,
     **fields: Any,
 ) -> Reading:
     """How scans become images: `fields` first, then the model's training scans, the scans'
@@ -338,8 +344,8 @@ def reading_for(
     built-in sensor whose beams plain scan files have. Scans have names as for `describe`; None is
     skipped. `model` is the checkpoint that they
     are for: another sensor or size than its own is refused. `estimate_scale` leaves None for plain
-    scan files whose
-    sensor does not tell it: an estimate.
+    scan files whose sensor does not tell it: an estimate. `estimate_beams` estimates the sensor of
+    plain scan files that no built-in sensor fits.
     """
     described = [describe(spec) for spec in scans if spec is not None]
     stored = next((one.stored for one in described if one.stored is not None), None)
@@ -350,7 +356,7 @@ def reading_for(
     }
     reading = replace(reading, **given)
     if described and not (model or stored or sensor):
-        sensor = _detected(first, reading)
+        sensor = _detected(first, reading, estimate_beams)
     chosen = named_sensor(sensor or reading.sensor, size)
     if model is not None and not chosen.same_image(model.sensor):
         raise InputError(
@@ -370,19 +376,42 @@ def reading_for(
     return replace(reading, reflectance_scale=scale)
 
 
-def _detected(scans: Described, reading: Reading) -> str | None:
-    """The built-in sensor of plain scan files whose beams are not those of `reading.sensor`."""
+def _detected(scans: Described, reading: Reading, estimate: bool) -> Sensor | str | None:
+    """The sensor of plain scan files whose beams are not those of `reading.sensor`: the nearest
+    built-in one, or with `estimate` their own if that does not fit.
+    """
     if scans.options.name != FOLDER:
         return None
     mismatch = mismatch_of(scans.paths, reading, scans.made_here)
-    if mismatch is None or not mismatch.sure:
+    if mismatch is None:
         return None
+    name = mismatch.name if mismatch.sure else None
+    if estimate and not (name and _fits(name, scans, reading)):
+        with suppress(InputError):
+            return _estimated(scans, reading)
+    if name:
+        log.warning(
+            "%s: read as scans of %s, whose beams are nearest; --sensor names another",
+            scans.label,
+            name,
+        )
+    return name
+
+
+def _fits(name: str, scans: Described, reading: Reading) -> bool:
+    own = replace(reading, sensor=SENSORS[name])
+    return mismatch_of(scans.paths, own, scans.made_here) is None
+
+
+def _estimated(scans: Described, reading: Reading) -> Sensor:
+    paths = [scans.paths[number] for number in spread(len(scans.paths), LOOKED_AT)]
+    sensor = estimate_sensor([*readable(paths, reading.columns)], "estimated").sensor
     log.warning(
-        "%s: read as scans of %s, whose beams are nearest; --sensor names another",
+        "%s: no built-in sensor fits; read by its own %s; --sensor names another",
         scans.label,
-        mismatch.name,
+        in_words(sensor.elevations),
     )
-    return mismatch.name
+    return sensor
 
 
 def _reading_of(model: Any) -> Reading:

@@ -3,7 +3,7 @@
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -134,11 +134,9 @@ def _files(
     )
     by_points = read_image
     if points := [path for path in paths if path not in images]:
-        scans = [
-            read_points(points[number], reading.columns)
-            for number in spread(len(points), LOOKED_AT)
-        ]
-        see, lines, whole = sight(described, points[0], scans, reading, source, scale)
+        chosen = [points[number] for number in spread(len(points), LOOKED_AT)]
+        scans = {path: read_points(path, reading.columns) for path in chosen}
+        see, lines, whole = sight(described, scans, reading, source, scale)
         by_points = lambda path: see(path, read_points(path, reading.columns))  # noqa: E731
     elif source and not source.same_image(target):
         lines += _described(spec, source, target)
@@ -156,8 +154,7 @@ def _files(
 
 def sight(
     described: Described,
-    path: Path,
-    scans: list[Points],
+    read: Mapping[Path, Points],
     reading: Reading,
     source: Sensor | None,
     scale: float | None = None,
@@ -165,8 +162,10 @@ def sight(
     """How scans of one sensor are seen as images of the model's, lines about the sensor, and a
     view that keeps all its beams, if the model's does not.
 
-    It is found from a few scans; `path` names them. For the others see `open_partial`.
+    It is found from a few scans, by path. For the others see `open_partial`.
     """
+    path = next(iter(read))
+    scans = [*read.values()]
     target = reading.sensor
     stored = described.stored
     spec = described.label
@@ -180,13 +179,14 @@ def sight(
             target
         )
     known = source or (target if same else None)
+    odd = bool(stored) or warn_of_frame(read)
     try:
         fired = sensor_of(scans, known)
     except InputError as error:
         raise InputError(
             f"{spec}: the sensor of the scans is not known, name it by {FROM}: {error}"
         ) from None
-    if not stored and not warn_of_frame(path, scans) and source and doubt and not doubt.finer:
+    if not odd and source and doubt and not doubt.finer:
         fits = f"; they fit {doubt.name}" if doubt.name else ""
         warn_odd(path, f"sensor {source.name} does not fit these scans: {doubt.seen}{fits}")
     of_sensor = known.reflectance_scale if known else None
@@ -254,9 +254,7 @@ def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -
             f"{target.row_edges[0]:+.1f} to "
             f"{target.row_edges[-1]:+.1f} degrees."
         )
-    measured = (
-        f"{len(set(rows[rows >= 0]))} of the {target.shape[0]} rows of {target.name} are measured"
-    )
+    measured = f"{len(set(rows[rows >= 0]))} of the {target.shape[0]} rows to complete are measured"
     few = turns and source.columns < FEWER * target.columns
     turn = f", in the columns that its {source.columns} rays a turn meet" if few else ""
     lines = [f"{spec}: {beams}; {measured}{turn}"]

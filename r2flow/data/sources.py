@@ -25,7 +25,7 @@ from r2flow.base.errors import InputError, check, warn_odd
 from r2flow.base.files import cache_folder
 from r2flow.base.progress import track
 from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
-from r2flow.lidar.estimation import Doubt, is_unclear, other_sensor
+from r2flow.lidar.estimation import Doubt, differing, in_words, is_unclear, other_sensor
 from r2flow.lidar.labels import common_classes
 from r2flow.lidar.scan_files import Points, read_points, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -154,24 +154,30 @@ def mismatch_of(paths: Sequence[str | Path], reading: Reading, ours: bool) -> Do
                 name = theirs.name if known else None
                 return Doubt(f"{MANIFEST} names {theirs}", name, sure=known)
         return None
-    looked_at = [paths[number] for number in spread(len(paths), LOOKED_AT)]
-    scans = [*readable(looked_at, reading.columns)]
-    mismatch = other_sensor(scans, reading.sensor) if scans else None
+    chosen = [paths[number] for number in spread(len(paths), LOOKED_AT)]
+    scans = {path: scan for path in chosen for scan in readable([path], reading.columns)}
+    mismatch = other_sensor([*scans.values()], reading.sensor) if scans else None
     if not scans or (mismatch and mismatch.hopeless):
         return mismatch
-    unclear = warn_of_frame(paths[0], scans)
+    unclear = warn_of_frame(scans)
     return None if unclear and not (mismatch and mismatch.sure) else mismatch
 
 
-def warn_of_frame(path: str | Path, scans: Sequence[Points]) -> bool:
-    """Warn, once per folder, of scans not in one sensor's own frame; whether they are not.
+def warn_of_frame(scans: Mapping[Any, Points]) -> bool:
+    """Warn, once per folder, of scans (by path) not in one sensor's own frame; whether they are
+    not.
 
     Warns of files of several turns, too.
     """
-    path = Path(path)
-    if any(turns(scan) > SEVERAL for scan in scans):
+    points = [*scans.values()]
+    path = Path(next(iter(scans)))
+    if any(turns(scan) > SEVERAL for scan in points):
         warn_odd(path, "a file holds several turns of the sensor; a scan is one: split it")
-    unclear = is_unclear(scans)
+    if pair := differing(points):
+        seen = " and ".join(f"{[*scans][n]} ({in_words(beams)})" for n, beams in pair)
+        warn_odd(path, f"read as scans of one sensor, but {seen} are of two: read them apart")
+        return True
+    unclear = is_unclear(points)
     if unclear:
         warn_odd(
             path,

@@ -97,8 +97,7 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
         ]
         distance, every = min((_distance(beams, table), n) for table, n in tables)
     if share < IN_VIEW or distance >= OFF or (distance > BEATEN and near < distance / 2):
-        ends = f"{beams[0]:+.1f} to {beams[-1]:+.1f} degrees"
-        return Doubt(f"they have {len(beams)} beams from {ends}, {seen}", name, sure=near < BEATEN)
+        return Doubt(f"they have {in_words(beams)}, {seen}", name, sure=near < BEATEN)
     if every > 1:
         seen = f"they have {len(beams)} beams, one of every {every} of its rows"
         return Doubt(seen, None, finer=True)
@@ -137,17 +136,42 @@ def is_tilted(scans: Sequence[Points]) -> bool:
 
 
 def is_unclear(scans: Sequence[Points]) -> bool:
-    """Whether scans are of two sensors, or points lie far from their beams, or `is_tilted`.
-
-    Points of two sensors in one file lie far from their beams.
-    """
-    with suppress(InputError):
-        if len({nearest_sensor(find_beams(scan).elevations)[0] for scan in scans} - {None}) > 1:
-            return True
+    """Whether points lie far from their beams, as of two sensors in one file, or `is_tilted`."""
     with suppress(InputError):
         if np.median(find_beams(*scans).off(scans)) > MOST_OFF:
             return True
     return is_tilted(scans)
+
+
+def differing(scans: Sequence[Points]) -> list[tuple[int, ndarray]]:
+    """Number and elevations of the first scan with beams and of the first of another sensor; empty
+    if all are of one.
+    """
+    seen: list[tuple[int, ndarray]] = []
+    for number, scan in enumerate(scans):
+        with suppress(InputError):
+            beams = find_beams(scan).elevations
+            if seen and _differ(seen[0][1], beams):
+                return [seen[0], (number, beams)]
+            seen.append((number, beams))
+    return []
+
+
+def _differ(one: ndarray, other: ndarray) -> bool:
+    """Whether beams are of two sensors: the built-in ones nearest to them are others, or they are
+    `OFF` (those of KITTI's scans 1.4 degrees at most). Some of the beams are of the same sensor.
+    """
+    few, many = sorted((one, other), key=len)
+    apart = abs(few[:, None] - many).min(axis=1)
+    if np.median(apart) < np.median(-np.diff(many)) / 10:
+        return False
+    names = {nearest_sensor(beams)[0] for beams in (one, other)} - {None}
+    return len(names) > 1 or min(_distance(one, other), _distance(other, one)) >= OFF
+
+
+def in_words(elevations: Sequence[float] | ndarray) -> str:
+    """Beams as '16 beams from +15.0 to -15.0 degrees'."""
+    return f"{len(elevations)} beams from {elevations[0]:+.1f} to {elevations[-1]:+.1f} degrees"
 
 
 def nearest_sensor(elevations: ndarray) -> tuple[str | None, float]:
@@ -165,7 +189,7 @@ def _family(name: str) -> str:
     return name.partition("_rings")[0]
 
 
-def _distance(beams: ndarray, elevations: Sequence[float]) -> float:
+def _distance(beams: ndarray, elevations: Sequence[float] | ndarray) -> float:
     """Distance in degrees of beams from those of a sensor.
 
     It is the 80th percentile over beams, paired in order at the best offset, as scans may be

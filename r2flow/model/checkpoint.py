@@ -182,7 +182,7 @@ class Checkpoint:
             source = None if sensor is None else named_sensor(sensor)
             described = Described(IN_MEMORY, SourceOptions(PLAIN, IN_MEMORY))
             reading = reading_for([], self)
-            see, remarks, _ = sight(described, Path(IN_MEMORY), [points], reading, source)
+            see, remarks, _ = sight(described, {Path(IN_MEMORY): points}, reading, source)
             for lost in remarks[1:]:
                 warnings.warn(lost.removeprefix(f"{IN_MEMORY}: "), stacklevel=3)
             kept = [self._without_rows() if remarks else self, see]

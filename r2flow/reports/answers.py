@@ -82,6 +82,7 @@ def write_completed(
         if not all(path.is_file() for path in files[scan.name])
     ]
     rays = np.zeros(len(Ray), int)  # of each state, of scans of points
+    added = 0
     outside = 0
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
     bar = Bar("completing", len(left) * job.num, "answers", evaluations=len(left) * batches)
@@ -104,7 +105,7 @@ def write_completed(
 
     def write(number: int, given: Partial, completed: Completed) -> tuple[Partial, Completed]:
         scan = scans[number]
-        _write(checkpoint, scan, out, files[scan.name], given, completed)
+        _write(checkpoint, scan, out, files[scan.name], given, completed, job)
         return given, completed
 
     with bar, _threads(checkpoint) as pool:
@@ -121,16 +122,22 @@ def write_completed(
                 _draw(checkpoint, scan, out, given, completed)
             if not completed.evaluations.any():
                 print(
-                    f"{scan.name}: everything is known, so nothing was completed; see --from, "
-                    "--fill-gaps and --mask"
+                    f"{scan.name}: every ray of the image is measured, so nothing is added; see "
+                    "--size, --from, --fill-gaps and --mask"
                 )
+            returned = completed.images[:, 0].numpy() > 0
+            added += int((returned & (given.state != Ray.RETURN)).sum())
             if not scan.image:
                 rays += np.bincount(given.state.ravel(), minlength=len(Ray))
                 outside += given.points.dropped if given.points else 0
         bar.set(len(left) * job.num)
     _print_counts(checkpoint, rays, outside)
-    skipped = f", {len(scans) - len(left)} there already" if len(left) < len(scans) else ""
-    print(f"{len(left)} scan{'' if len(left) == 1 else 's'} written to {out}{skipped}")
+    written = f"{len(left)} scan{'' if len(left) == 1 else 's'} written to {out}"
+    skipped = [f"{len(scans) - len(left)} there already"] if len(left) < len(scans) else []
+    new = [f"{added / len(left) / job.num:,.0f} new points a scan"] if left else []
+    endings = {scan.ending: files[scan.name][0].suffix for scan in scans}
+    other = [f"{own} as {given}" for own, given in endings.items() if own != given]
+    print(", ".join([written, *skipped, *new, *other]))
 
 
 def _print_counts(checkpoint: Checkpoint, rays: ndarray, outside: int) -> None:
@@ -257,6 +264,7 @@ def _write(
     files: Sequence[Path],
     given: Partial,
     completed: Completed,
+    job: Job,
 ) -> None:
     """Write the answers to a scan, and the spread of several."""
     if len(files) > 1:
@@ -265,13 +273,15 @@ def _write(
             np.savez_compressed(file, deviation=deviation, returned=returned)
     known = given.state == Ray.RETURN
     rays = checkpoint.sensor.rays()
+    silent = given.points.reflectance is None if given.points else len(given.image) == 1
+    silent &= "reflectance" not in job.hide  # else that of the answer would be invented
     labelled = checkpoint.encoding.labels
     for path, image in zip(files, completed.images.numpy(), strict=True):
         name = path.name.removesuffix(scan_ending(path.name) or path.suffix)
         if scan.image:
             if labelled:
                 write_labelled(image, rays, path.parent, name, ["ply"])
-            save_array(path, image[:2])
+            save_array(path, image[: 1 if silent else 2])
             continue
         xyz, values = image_points(image * known, rays, given.xyz)
         if given.points is not None:  # in the order of the file
@@ -289,7 +299,10 @@ def _write(
         values = np.concatenate([values, estimated], axis=1)
         if labelled:
             write_labels(path.parent, name, *values[1:])
-        write_points(path, xyz, values[0] if len(values) else None)
+        strength = values[0] if len(values) else None
+        if silent:  # a .bin has this column
+            strength = np.zeros(len(xyz)) if path.suffix == ".bin" else None
+        write_points(path, xyz, strength)
 
 
 def _draw(

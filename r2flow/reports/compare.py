@@ -1,4 +1,4 @@
-"""Comparison of runs: settings, losses, bend and cost; and the report at the end of a chain."""
+"""Comparison of runs: settings, losses, bend and cost."""
 
 import json
 import math
@@ -7,14 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean, stdev
 
-from matplotlib.figure import Figure
-
 from r2flow.base.config import flatten, learned
-from r2flow.model.checkpoint import Checkpoint, load_checkpoint
-from r2flow.reports.outputs import what_next, write_samples
-from r2flow.reports.pages import Page, write_page
-from r2flow.reports.pictures import contact_sheet
-from r2flow.reports.runs import ComparedRun, read_runs
+from r2flow.reports.pages import Page
+from r2flow.reports.runs import ComparedRun
 from r2flow.reports.tables import Row, print_table, table
 from r2flow.reports.training import curves_figure
 from r2flow.runs.folder import read_config
@@ -164,47 +159,3 @@ def compare_page(groups: Groups) -> Page:
         seeds,
         more={"runs": each},
     )
-
-
-def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> None:
-    """Write the report of a chain: the comparison of its runs, their first scan, and scans of the
-    last one.
-
-    `runs` are the folders by name of the link, in order.
-    """
-    groups = {run.label: [run] for run in read_runs(list(runs.values()))}
-    print_comparison(groups)
-    page = compare_page(groups)
-    loaded = {name: load_checkpoint(run, device) for name, run in runs.items()}
-    makers = {name: model for name, model in loaded.items() if model.generator.unconditional}
-    page.figures["steps"] = _steps_figure(makers)
-    name, last = list(makers.items())[-1]
-    write_samples(last, out, num=4, seed=0, pictures=4, replace=True)
-    *_, text = write_page(page, out)
-    learned = last.config | {"data": next(iter(loaded.values())).config.get("data", {})}
-    print(
-        f"""
-pictures      {out / "steps.png"} (every link, in one step and in many)
-              {out / "samples.png"} ({name})
-in 3-D        {out / "samples.html"}, in a browser
-point clouds  {out / "000000.ply"} ...
-table         {text}
-{what_next(runs[name], out, config=learned)}
-
-Open {out / "steps.png"} first.""",
-        flush=True,
-    )
-
-
-def _steps_figure(makers: Mapping[str, Checkpoint]) -> Figure:
-    """The scan of the same noise by each generator, in one step and by its own sampler."""
-    images = []
-    titles = []
-    for name, model in makers.items():
-        samplers = [model.generator.sampler]
-        if not model.generator.fixed and hasattr(samplers[0], "steps"):
-            samplers = [model.generator.choose(steps=1), *samplers]
-        for sampler in samplers:
-            images.append(model.sample(1, sampler=sampler)[0].numpy())
-            titles.append(f"{name}, {sampler}")
-    return contact_sheet(images, model.sensor.rays(), titles)

@@ -30,6 +30,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         "generator": (config.get("generator") or {}).get("name", "rectified_flow"),
         "backbone": (config["backbone"] or {}).get("name"),
         "parameters": sum(parameter.numel() for parameter in generator.parameters()),
+        "sensor": loaded.sensor.name,
         "image": list(loaded.encoding.shape),
         "range_m": [loaded.sensor.min_range, loaded.sensor.max_range],
         **about,

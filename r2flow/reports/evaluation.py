@@ -8,10 +8,24 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from r2flow.evaluation.comparing import Comparison, Comparisons
+from r2flow.metrics.panel import PANEL
 from r2flow.reports.pages import Page, Plot, lines_figure
 from r2flow.reports.tables import Row, print_table, table
 from r2flow.reports.verdict import heading, remarks_of, verdict
 
+_THINGS = {
+    "straight walls": "straight walls, share",
+    "right angles": "right angles, 0 to 1",
+    "poles": "poles a scan",
+    "cars": "cars a scan",
+}
+# Of lines of the table; those of the panel are parts of the line above them.
+_TITLES = {
+    "panel": "panel, 0 to 1: mean of",
+    **{name: f"- {name}" for name in PANEL},
+    **_THINGS,
+    **{f"{name}, real": f"{title}, real" for name, title in _THINGS.items()},
+}
 _SPEED = {"evaluations": "network evaluations a scan", "seconds": "seconds a scan"}
 
 
@@ -41,7 +55,7 @@ def print_comparisons(comparisons: Comparisons) -> None:
     columns, lines = _table(comparisons)
     numbers = [str(number) for number in range(1, len(columns))]
     print(_protocol(comparisons))
-    print_table(list(zip(numbers, columns[1:], strict=True)), ("", "its scans : real"))
+    print_table(list(zip(numbers, columns[1:], strict=True)), ("", "set (its scans : real scans)"))
     print()
     print_table(lines, ["", *numbers])
     for remark in remarks_of(comparisons):
@@ -94,7 +108,11 @@ def _table(comparisons: Comparisons) -> tuple[list[str], list[list[str]]]:
             column[row["printed_as"]] = "none" if missing else f"{row['printed']:#.4g}"
         columns.append(column)
     titles = dict.fromkeys(title for column in columns for title in column)
-    return headings, [[title, *(column.get(title, "") for column in columns)] for title in titles]
+    lines = [
+        [_TITLES.get(title, title), *(column.get(title, "") for column in columns)]
+        for title in titles
+    ]
+    return headings, lines
 
 
 def _plain_comparison(comparison: Comparison) -> Row:

@@ -87,8 +87,9 @@ def short_names(paths: Sequence[Path]) -> list[str]:
 
 
 def words(values: Mapping[str, Any]) -> str:
-    """Format named values: 'cores 2, threads 1'."""
-    return ", ".join(f"{key} {shown(value)}" for key, value in values.items())
+    """Format named values that are not None: 'cores 2, threads 1'."""
+    given = {key: value for key, value in values.items() if value is not None}
+    return ", ".join(f"{key} {shown(value)}" for key, value in given.items())
 
 
 def _as_text(rows: Rows, columns: Columns) -> list[list[str]]:

@@ -10,11 +10,14 @@ _ENOUGH = 100  # least number of scans of a set, or of a half of the real ones, 
 _MARGIN = 1.5
 _HEADLINE = "panel"  # metric of the verdict, if measured
 
-# Values that published tables print scaled: heading and factor, for printing only.
+# Heading and factor of values, for printing only: published tables print some scaled.
 PRINTED = {
     "jsd": ("JSD x 10^2", 1e2),
     "mmd": ("MMD x 10^4", 1e4),
-    "seconds": ("s a scan", 1.0),
+    "kid_handcrafted": ("KID, hand-made features", 1.0),
+    "frechet_handcrafted": ("Frechet distance, hand-made features", 1.0),
+    "evaluations": ("network evaluations a scan", 1.0),
+    "seconds": ("seconds a scan", 1.0),
 }
 
 _Value = tuple[float, Comparison]
@@ -111,7 +114,7 @@ def remarks_of(comparisons: Comparisons) -> list[str]:
         ]
         if below:
             lines.append(
-                f"{metric} ranks nothing here, with baselines below the real halves: "
+                f"do not rank by {metric} here: baselines are below the real halves: "
                 f"{', '.join(below)}."
             )
     sets: dict[str, dict[str, None]] = {}  # by remark

@@ -210,16 +210,10 @@ def _chain(settings: Config, given: Sequence[str], folders: Sequence[str]) -> in
     if finished and out.is_dir():
         print(f"report: finished before, {out / 'compare.md'}")
     elif int(os.environ.get("LOCAL_RANK", "0")) == 0:
-        from r2flow.reports.compare import report_chain
+        from r2flow.reports.chain import report_chain
 
         runs = {link.name: link.run_dir for link in links}
         report_chain(runs, out, _report_device(settings["trainer"]))
-        if settings["preview"]:
-            picture = folder / "preview" / "samples.png"
-            print(
-                f"Flows trained this briefly draw noisy scans; {picture} shows those of "
-                f"{settings['preview']}, after long training."
-            )
     return 0
 
 

@@ -136,7 +136,7 @@ def test_a_flow_is_straightened(tmp_path: Path, tmp_path_factory: pytest.TempPat
 
 CANNOT = {
     "interpolate": (
-        ["SCAN", "SCAN", "-c", "RUN", "-o", "OUT"], "needs the velocity of a flow from noise; a ToyGenerator"
+        ["RUN", "SCAN", "SCAN", "-o", "OUT"], "needs the velocity of a flow from noise; a ToyGenerator"
     ),
     "report "
     "curvature": (["RUN", "-o", "OUT"], "curvature needs the velocity of a flow from noise; a ToyGenerator"),

@@ -11,6 +11,7 @@ from r2flow.data.reading import Reading, scaled_reflectance
 from r2flow.data.sources import warn_of_frame, warn_of_other_sensor
 from r2flow.lidar.beams import FIRINGS, RING_AFTER_RING, RINGS, UNORDERED, find_beams
 from r2flow.lidar.estimation import (
+    differing,
     estimate_sensor,
     full_reflectance,
     is_tilted,
@@ -380,7 +381,20 @@ def test_points_in_the_frame_of_a_pitched_vehicle_are_found(name: str):
     for degrees, tilted in ((0, False), (0.5, False), (2, True), (-5, True)):
         assert is_tilted([pitched(level, degrees)]) == tilted, degrees
     other = scan(SENSORS["os1_64" if name == "vlp16" else "vlp16"].resized(columns=384), UNORDERED)
-    assert [warn_of_frame(name, [level, second]) for second in (level, other)] == [False, True]
+    assert [warn_of_frame({name: level, "2": second}) for second in (level, other)] == [False, True]
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_scans_of_two_sensors_differ_and_a_thinned_scan_does_not(name: str):
+    whole = scan(SENSORS[name].resized(columns=384), RINGS)
+    third = Points(whole.xyz[whole.ring % 3 == 0], None, whole.ring[whole.ring % 3 == 0])
+    assert differing([whole, third, third, whole]) == []
+    other = "hdl32e" if name == "vlp32c" else "vlp32c"
+    (first, _), (second, beams) = differing(
+        [whole, third, scan(SENSORS[other].resized(columns=384), RINGS)]
+    )
+    assert (first, second) == (0, 2)
+    np.testing.assert_allclose(beams, SENSORS[other].elevations, atol=0.01)
 
 
 def test_real_scans_are_tilted_only_in_another_frame(shared: Path):

@@ -11,11 +11,12 @@ import yaml
 
 from r2flow.base.errors import InputError
 from r2flow.base.signals import LATER
+from r2flow.data.datamodule import ScanDataModule
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.paths import checkpoints_of
 from r2flow.model.saving import weights_hash
 from r2flow.model.tensor_files import read_checkpoint
-from r2flow.reports.compare import report_chain
+from r2flow.reports.chain import _INCLUDED, _advice, _with_distances, report_chain
 from r2flow.runs.chain import links_of
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import has_ended
@@ -107,10 +108,11 @@ def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
         "8 pairs",
         "evaluations a pair",
         "pairs/s",
+        "rf1, trained on scans ",
+        "best baseline: ",
         "r2flow sample",
     ):
         assert words in said
-    assert said.rstrip().endswith("Open runs/demo/report/steps.png first.")
     first, second, third = (load_checkpoint(run / link) for link in LINKS)
     assert [flow.config["stage"]["name"] for flow in (first, second, third)] == [
         "rectify",
@@ -129,6 +131,30 @@ def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
         0,
         8,
     )
+
+
+def test_the_report_s_distance_of_the_held_out_scans_themselves_is_0(chained: tuple[Path, str]):
+    first, second = (load_checkpoint(chained[0] / link) for link in LINKS[:2])
+    groups = {key: first.config[key] for key in ("sensor", "encoding", "seed")}
+    data = ScanDataModule(**first.config["data"], **groups)
+    data.read()
+    held_out = data.validation_source.batch(range(len(data.validation_source))).numpy()
+    drawn = [({"scans": "street", "calls": 1.0}, held_out), ({"scans": "mine"}, held_out * 0.5)]
+    _, rows = _with_distances(drawn, first)
+    exact, halved, trained, baseline = (row["distance"] for row in rows)
+    assert exact == 0 < trained < baseline
+    assert halved > 0.1
+    assert _with_distances(drawn, second) == ("Scans drawn", [row for row, _ in drawn])  # on pairs
+
+
+@pytest.mark.parametrize(("distance", "advised"), [(0.1, True), (0.3, False)])
+def test_the_included_model_is_advised_where_it_is_nearer(distance: float, advised: bool):
+    rows = [
+        {"scans": "rf1", "calls": 1.0, "distance": 0.2},
+        {"scans": _INCLUDED, "calls": 2.0, "distance": distance},
+        {"scans": "scans of the training", "distance": 0.01},
+    ]
+    assert ("r2flow sample street" in _advice(rows)) == advised
 
 
 def test_a_finished_chain_is_not_run_again(chained: tuple[Path, str], scans: Path, tmp_path: Path):

@@ -15,7 +15,7 @@ from r2flow.base.plugins import load_plugins, made_with, take_plugins
 from r2flow.base.registry import Registry
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.model.saving import save_checkpoint
-from r2flow.reports.compare import read_runs
+from r2flow.reports.runs import read_runs
 from r2flow.runs.composing import REGISTRIES, choices, compose
 from r2flow.runs.folder import open_run
 from r2flow.stages import STAGES
