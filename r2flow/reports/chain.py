@@ -98,7 +98,8 @@ def _draw(model: Checkpoint, label: str, sampler: Sampler) -> tuple[Row, ndarray
         "calls": float(np.mean(calls)),
         "seconds": sum(batch.seconds for batch in batches) / _SCANS,
     }
-    return row, np.concatenate([batch.images.nan_to_num(0.0).numpy() for batch in batches])
+    images = [batch.images[:, :2].nan_to_num(0.0).numpy() for batch in batches]  # without labels
+    return row, np.concatenate(images)
 
 
 def _with_distances(
@@ -116,10 +117,10 @@ def _with_distances(
         isinstance(training, ScanSource) and isinstance(held_out, ScanSource) and held_out.names
     ):
         return "Scans drawn", rows
-    truth = panel(ScanSet("", held_out, data.sensor)[:].numpy(), data.sensor)
+    truth = panel(ScanSet("", held_out, data.sensor)[:][:, :2].numpy(), data.sensor)
 
     def distance(images: ndarray) -> float:
-        return mean_distance(distances(truth, panel(images, data.sensor)))
+        return mean_distance(distances(truth, panel(images[:, :2], data.sensor)))
 
     trained = ScanSet("", training, data.sensor).spread(_SCANS)
     baselines = baseline_sets(trained, _SCANS).items()
