@@ -267,3 +267,13 @@ def test_labels_are_painted(r2flow, tmp_path: Path):
     done = r2flow("show", "simulated:0", "--num", 1, "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     assert [*tmp_path.glob("*.png")]
+
+
+def test_labels_alone_of_another_sensor_take_one_evaluation():
+    flow = built().at(build_space(CONFIG), numbered=False)
+    assert flow.foreign
+    images = labelled_scans(1)[:, :2]
+    (whole,) = complete(flow, images, ray_states(images))
+    (half,) = complete(flow, images, ray_states(images, EVERY_2ND))
+    assert (whole.evaluations == 1).all()
+    assert (half.evaluations > 1).all()

@@ -151,7 +151,7 @@ class TransferFlow(Flow):
         """
         inputs = self._inputs(x, about, rows)
         output = self.backbone(t, inputs).float()
-        if self.foreign:
+        if self.foreign and bool((about.sure == 0).any()):
             elevation = x.shape[1] - self.classes + FEATURES + ROW
             inputs[:, elevation] += STEEP * _RAISED
             output[:, _RETURN] = self.backbone(t, inputs).float()[:, _RETURN]
@@ -312,7 +312,8 @@ class TransferFlow(Flow):
         measured["rows"] = self.rows(elevations, steps, numbered)
         noise = self.sigma * noise.to(weight)
         measured |= {"gain": gain, "share": torch.ones_like(gain)}
-        tested = bool((gain != 1).any())
+        hidden = bool((known[:, :1] < 1).any())  # else labels alone are drawn
+        tested = hidden and bool((gain != 1).any())
         if tested:
             with autocast(self.device, how.get("precision", "32-true")):
                 measured["share"] = self._share(measured, noise, steps)
@@ -322,7 +323,7 @@ class TransferFlow(Flow):
         x = torch.where(within_reach(known.amax(1, True)), x, self._empty(image[:, :1]))
         x = torch.where(known > 0, image, x)
         # See `answers` and `_share`.
-        evaluations = generated.evaluations * (2 if self.foreign else 1) + tested
+        evaluations = generated.evaluations * (2 if self.foreign and hidden else 1) + tested
         return replace(generated, x=x, evaluations=evaluations)
 
     def loss(
