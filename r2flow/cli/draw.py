@@ -100,12 +100,7 @@ def sample(
     sampler = loaded.generator.choose(**how.given)
     chosen = [*dict.fromkeys(format.split(","))] if format else None
     region = _region(loaded, sector, rows) if sector or rows else None
-    labeller = None
-    if labels:
-        check(region is None, "--labels needs whole scans: leave --sector and --rows out.")
-        labeller = load_checkpoint(labels, device=choose_device(draw.device))
-        check(labeller.encoding.labels, f"{labels} has no labels: give --labels labels.")
-        labeller = labeller.through(loaded.sensor)
+    check(not (labels and region), "--labels needs whole scans: leave --sector and --rows out.")
     formats = write_samples(
         loaded,
         out,
@@ -117,13 +112,22 @@ def sample(
         draw.batch_size,
         region,
         precision=precision,
-        labels=labeller,
+        labels=_labelling(labels, loaded) if labels else None,
     )
     there = len(list(out.glob(f"[0-9]*.{formats[0]}")))
     more = f", next to {there - draw.num} of an earlier command" if there > draw.num else ""
     print(f"{several(draw.num)} ({', '.join(formats)}) in {out}{more}")
     if pictures:
         print(f"pictures in {out / 'samples.png'}, in 3-D in {out / 'samples.html'}")
+
+
+def _labelling(name: str, drawn: "Checkpoint") -> "Checkpoint":
+    """The labelled model of a name, for the scans of another one."""
+    from r2flow.model.checkpoint import load_checkpoint
+
+    model = load_checkpoint(name, drawn.generator.device)
+    check(model.encoding.labels, f"{name} has no labels: give --labels labels.")
+    return model.through(drawn.sensor)
 
 
 def _print_model(name: str) -> None:

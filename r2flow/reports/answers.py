@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
@@ -81,9 +81,7 @@ def write_completed(
         for number, scan in enumerate(scans)
         if not all(path.is_file() for path in files[scan.name])
     ]
-    rays = np.zeros(len(Ray), int)  # of each state, of scans of points
-    added = 0
-    outside = 0
+    counts = _Counts()
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
     bar = Bar("completing", len(left) * job.num, "answers", evaluations=len(left) * batches)
 
@@ -120,28 +118,41 @@ def write_completed(
             scan = scans[number]
             if number < job.pictures:
                 _draw(checkpoint, scan, out, given, completed)
-            if not completed.evaluations.any():
-                print(
-                    f"{scan.name}: every ray of the image is measured, so nothing is added; see "
-                    "--size, --from, --fill-gaps and --mask"
-                )
-            returned = completed.images[:, 0].numpy() > 0
-            added += int((returned & (given.state != Ray.RETURN)).sum())
-            if not scan.image:
-                rays += np.bincount(given.state.ravel(), minlength=len(Ray))
-                outside += given.points.dropped if given.points else 0
+            counts.add(scan, given, completed)
         bar.set(len(left) * job.num)
-    _print_counts(checkpoint, rays, outside)
+    _print_counts(checkpoint, counts)
     written = f"{len(left)} scan{'' if len(left) == 1 else 's'} written to {out}"
     skipped = [f"{len(scans) - len(left)} there already"] if len(left) < len(scans) else []
-    new = [f"{added / len(left) / job.num:,.0f} new points a scan"] if left else []
+    new = [f"{counts.added / len(left) / job.num:,.0f} new points a scan"] if left else []
     endings = {scan.ending: files[scan.name][0].suffix for scan in scans}
     other = [f"{own} as {given}" for own, given in endings.items() if own != given]
     print(", ".join([written, *skipped, *new, *other]))
 
 
-def _print_counts(checkpoint: Checkpoint, rays: ndarray, outside: int) -> None:
-    """Print what was taken of points, from the number of rays of each state."""
+@dataclass
+class _Counts:
+    """What was taken of scans of points, and added to scans."""
+
+    rays: ndarray = field(default_factory=lambda: np.zeros(len(Ray), int))  # of each state
+    outside: int = 0  # points
+    added: int = 0
+
+    def add(self, scan: PartialScan, given: Partial, completed: Completed) -> None:
+        if not completed.evaluations.any():
+            print(
+                f"{scan.name}: every ray of the image is measured, so nothing is added; see "
+                "--size, --from, --fill-gaps and --mask"
+            )
+        returned = completed.images[:, 0].numpy() > 0
+        self.added += int((returned & (given.state != Ray.RETURN)).sum())
+        if not scan.image:
+            self.rays += np.bincount(given.state.ravel(), minlength=len(Ray))
+            self.outside += given.points.dropped if given.points else 0
+
+
+def _print_counts(checkpoint: Checkpoint, counts: _Counts) -> None:
+    """Print what was taken of points."""
+    rays = counts.rays
     share = rays[Ray.EMPTY] / max(rays[Ray.EMPTY] + rays[Ray.RETURN], 1)
     if share > 0.5:  # 31 % at most of real scans
         print(
@@ -151,8 +162,8 @@ def _print_counts(checkpoint: Checkpoint, rays: ndarray, outside: int) -> None:
         sensor = checkpoint.sensor
         rows, columns = sensor.shape
         print(
-            f"used: the nearest point in each pixel of {rows}x{columns}; {outside:,} outside "
-            f"{sensor.min_range:g}-{sensor.max_range:g} m left out"
+            f"used: the nearest point in each pixel of {rows}x{columns}; {counts.outside:,} "
+            f"outside {sensor.min_range:g}-{sensor.max_range:g} m left out"
         )
 
 

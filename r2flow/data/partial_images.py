@@ -1,0 +1,73 @@
+"""Range images and maps of labels in .npy files as partially measured images."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from r2flow.base.errors import InputError, check
+from r2flow.lidar.encoding import FAR, wrong_with
+from r2flow.lidar.known import Ray
+from r2flow.lidar.labels import common_classes
+from r2flow.lidar.other_sensors import Partial, image_through
+from r2flow.lidar.scan_files import read_numbers, read_range_image
+from r2flow.lidar.sensors import Sensor
+
+FROM = "--from, in Python by sensor"
+
+
+def is_image(path: Path) -> bool:
+    """Whether an array is a range image, or a map of labels, of integers."""
+    array = read_numbers(path)
+    return array.ndim == 3 or (array.ndim == 2 and array.dtype.kind in "iu")
+
+
+def _read_labels(path: Path, ids: np.ndarray, target: Sensor) -> Partial:
+    """A map of labels, SemanticKITTI's ids, (H, W), of rays that were not measured."""
+    if ids.shape != target.shape:
+        size = "x".join(map(str, target.shape))
+        found = "x".join(map(str, ids.shape))
+        raise InputError(f"{path} is a map of labels of {found}, those of the model are {size}.")
+    image = np.zeros((3, *target.shape), np.float32)
+    image[2] = common_classes(ids)
+    if not image.any():
+        raise InputError(f"{path} has no label: 0 is a ray whose class is not known.")
+    return Partial(image, np.full(target.shape, Ray.UNKNOWN, np.uint8))
+
+
+def read_partial(path: Path, source: Sensor | None, target: Sensor, labels: bool) -> Partial:
+    """A range image of floats, (2 or 1, H, W), of a sensor, or with `labels` a map of labels, as a
+    partially measured image of another one; InputError: it is neither.
+    """
+    stored = read_numbers(path)
+    if stored.ndim == 2:
+        check(labels, f"{path} is a map of labels: give a model with labels, -c labels.")
+        return _read_labels(path, stored, target)
+    found = f"found {stored.dtype} {stored.shape}"
+    other = f"{path} must be a range image of floats (2 or 1, H, W), {found}."
+    check(stored.dtype.kind == "f" and len(stored) in (1, 2) and stored.size, other)
+    wrong = wrong_with(torch.from_numpy(stored.astype(np.float32)), max(FAR, target.max_range))
+    check(not wrong, f"{path}: {wrong}; --mask FILE.npy names what was not measured.")
+    r = stored[0]
+    within = not r.any() or ((r >= target.min_range) & (r <= target.max_range)).any()
+    check(
+        within,
+        f"{path}: none of its ranges lies within {target.min_range:g}-{target.max_range:g} m. Are "
+        "they in m?",
+    )
+    image = read_range_image(path)
+    if image is None:  # empty, or points (1, N, 4)
+        raise InputError(other)
+    if source is not None and image.shape[1] == source.shape[0]:
+        return image_through(image, source.resized(columns=image.shape[2]), target)
+    if source is not None or image.shape[1:] != target.shape:
+        size, model = ("x".join(map(str, shape)) for shape in (image.shape[1:], target.shape))
+        found = f" ({source.name} has {source.shape[0]})" if source else ""
+        advice = (
+            f"name its sensor of {image.shape[1]} rows by {FROM}{found}, or --size {size} alone "
+        )
+        advice += "with densify"
+        raise InputError(
+            f"{path} is a range image of {size}, those of the model are {model}: {advice}."
+        )
+    return image_through(image, target, target)
