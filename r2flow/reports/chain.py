@@ -126,8 +126,8 @@ def _with_distances(
     baselines = baseline_sets(trained, _SCANS).items()
     best, name = min((distance(scans[:].numpy()), name) for name, scans in baselines)
     about = (
-        f"Distance of {_SCANS} scans of each to {len(held_out)} held-out scans "
-        "(0: equal statistics); evaluations: runs of the network a scan"
+        f"Distance of {_SCANS} scans of each to {len(held_out)} unseen scans, smaller is better; "
+        "evaluations: runs of the network a scan"
     )
     return about, [
         *({**row, "distance": distance(images)} for row, images in drawn),
@@ -142,6 +142,6 @@ def _advice(rows: Sequence[Row]) -> str:
     if not flows or flows[min(flows)] != _INCLUDED:
         return ""
     return f"""
-{DEFAULT} has trained for longer and is nearer: draw with it, or train it on your scans.
+{DEFAULT} trained longer, and its scans are closer to the unseen ones. Use it, or fine-tune it:
   r2flow sample {DEFAULT} --num 16 --out scans
   r2flow train experiment=finetune stage.parent={DEFAULT} data.root=FOLDER"""
