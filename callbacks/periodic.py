@@ -84,7 +84,7 @@ class SamplePictures(Periodic):
             self.sampler(generator)
 
     def setup(self, trainer, pl_module, stage):
-        generator: Generator = pl_module.generator  # type: ignore[assignment]
+        generator: Generator = pl_module.generator
         self.check(generator)
 
     def act(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:

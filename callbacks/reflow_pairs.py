@@ -16,7 +16,7 @@ class ReflowPairs(L.Callback):
     """
 
     def setup(self, trainer, pl_module, stage):
-        data = trainer.datamodule  # type: ignore[attr-defined]
+        data = trainer.datamodule
         if not isinstance(data, ScanDataModule) or data.pairs is None:
             return
         if data.pairs.of is None and not pl_module.hparams.get("parent"):
