@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from matplotlib.colors import to_rgb
 
 from r2flow.base.errors import InputError
 from r2flow.base.noise import generator as draws
@@ -20,6 +21,7 @@ from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.metrics.labels import class_ious, confusion, mean_iou
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import complete
+from r2flow.reports.pictures import scan_figure
 from r2flow.simulator import simulate
 from r2flow.stages.transfer import Tasks, Transfer
 from tests.conftest import SENSOR, write_run
@@ -263,10 +265,16 @@ def test_a_map_of_labels_becomes_a_scan(r2flow, run: Path, tmp_path: Path):
     assert "is a map of labels of 8x63, those of the model are 8x64" in again.refusal
 
 
-def test_labels_are_painted(r2flow, tmp_path: Path):
-    done = r2flow("show", "simulated:0", "--num", 1, "--out", tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert [*tmp_path.glob("*.png")]
+def test_a_picture_paints_labels_with_the_names_of_their_classes():
+    scan = simulate(SENSOR, 0, 0)
+    figure = scan_figure(scan.image, SENSOR.rays(), labels=scan.labels)
+    (legend,) = [axes.get_legend() for axes in figure.axes if axes.get_legend()]
+    names = {text.get_text() for text in legend.get_texts()}
+    assert names <= {CLASSES[number][0] for number in np.unique(scan.labels)}
+    assert "road" in names
+    (painted,) = legend.axes.get_images()
+    shown = painted.get_array()[scan.labels == 40]
+    np.testing.assert_allclose(shown, np.broadcast_to(to_rgb(CLASSES[40][1]), shown.shape))
 
 
 def test_labels_alone_of_another_sensor_take_one_evaluation():
