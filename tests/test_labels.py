@@ -235,6 +235,8 @@ def test_complete_writes_labels_and_probabilities_and_evaluate_judges_them(
     right = np.mean(common_classes(ids[: len(xyz)]) == classes)
     (line,) = [line for line in judged.said.splitlines() if line.startswith("right  ")]
     assert line.split() == ["right", f"{right:.3g}", str(len(xyz))]
+    refused = r2flow("evaluate", truth, out, "--metrics", "miou", "--json", tmp_path / "e.json")
+    assert "leave --json and --out out" in refused.refusal
     # Labels that are given are kept.
     kept = r2flow("complete", truth / "0.bin", "-c", run, "--out", tmp_path / "kept")
     assert kept.returncode == 0, kept.stderr

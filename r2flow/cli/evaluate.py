@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Argument
 
 from r2flow.base.devices import choose_device
-from r2flow.base.errors import InputError, check_folder
+from r2flow.base.errors import InputError, check, check_folder
 from r2flow.cli.app import app
 from r2flow.cli.options import SETS, ReadingOptions, grouped
 from r2flow.cli.sets import EvaluateOptions, judged_sets, open_set, possible_metrics, reading_of
@@ -47,6 +47,13 @@ def evaluate(
     if not (named or options.reference or options.baselines):
         raise InputError("nothing to compare with: give GENERATED or --reference.")
     if options.metrics == "miou":
+        check(
+            bool(named),
+            "miou compares labels: give GENERATED, scans with labels of the same names.",
+        )
+        check(
+            not (options.json or options.out), "miou is printed alone: leave --json and --out out."
+        )
         return _evaluate_labels(real, named)
     with process_group(choose_device(options.device)) as device:
         _evaluate(real, named, options, how, device)

@@ -254,11 +254,13 @@ class TransferFlow(Flow):
         inputs = self._inputs(about.start + (kept < 1) * noise, about, condition["rows"])
         output = self.backbone(torch.zeros((), device=noise.device), inputs).float()
         metres = self.space.decode(image)
-        told = hidden & (known[:, 1:2] > 0) & (metres[:, :1] > 0)
+        compared = hidden & (known[:, 1:2] > 0) & (metres[:, :1] > 0)
         error = metres[:, 1:2] - self._read(output, about, gain, 0.0).strength()
         correction = output[:, _STRENGTH] / gain
         shares = torch.linspace(1, 0, 11, device=noise.device)
-        errors = [(told * (error - share * correction).abs()).sum((1, 2, 3)) for share in shares]
+        errors = [
+            (compared * (error - share * correction).abs()).sum((1, 2, 3)) for share in shares
+        ]
         return shares[torch.stack(errors).argmin(0)][:, None, None, None]
 
     def _chosen(self, answers: Answers) -> Tensor:

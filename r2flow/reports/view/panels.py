@@ -60,10 +60,8 @@ def share_scale(readings: Mapping[str, Reading], most: int) -> dict[str, Reading
     return {**readings, **scaled}
 
 
-def scan_panels(
-    readings: Mapping[str, Reading], most: int, labelled: bool = True
-) -> Iterator[tuple[str, Panel]]:
-    """Sets and a panel for each of up to `most` scans of them, evenly spread; `labelled`: with ids.
+def scan_panels(readings: Mapping[str, Reading], most: int) -> Iterator[tuple[str, Panel]]:
+    """Sets and a panel for each of up to `most` scans of them, evenly spread, with their labels.
 
     The caption is the file name, with folders if names are ambiguous. Files not written by r2flow
     are opened one by one, since sizes of range images and reflectance may differ.
@@ -88,7 +86,7 @@ def scan_panels(
     captions = short_names([path for _, path, *_ in views])
     for (spec, _, scans, number), caption in zip(views, captions, strict=True):
         image = scans.source[number]
-        classes = _read_labels(scans.source, number) if labelled else None
+        classes = _read_labels(scans.source, number)
         yield spec, Panel(caption, image[None], scans.sensor.rays(), classes)
 
 
