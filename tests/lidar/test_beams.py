@@ -258,6 +258,7 @@ def real(shared, pattern: str, step: int = 1, most: int | None = None) -> list[P
             0.01,
             1809,
         ),  # a firing each 55.296 us, 10 turns a second
+        ("pandaset/*/lidar/*.pkl.gz", 2, "pandar64", UNORDERED, 0.05, 1800),
     ],
 )
 def test_the_beams_of_real_sensors(shared, scans, step, name, order, off, steps):
