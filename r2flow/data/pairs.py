@@ -164,10 +164,11 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
         missing = store.missing(store.shards)
         store.make(random.Random().sample(missing, len(missing)), make_shard, wait=wait)
     if usable:
+        lost = usable.count(False)
         print(
-            f"{len(usable)} pairs drawn in whole batches, {len(usable) / seconds:.2f} pairs/s, "
-            f"{evaluations / len(usable):.1f} evaluations a pair, {usable.count(False)} did not "
-            "converge and are left out",
+            f"{len(usable)} pairs of noise and scan drawn, {len(usable) / seconds:.1f} pairs/s, "
+            f"{evaluations / len(usable):.3g} evaluations a pair"
+            + (f"; left out: {lost} did not converge" if lost else ""),
             flush=True,
         )
     return usable

@@ -108,13 +108,13 @@ def contact_sheet(
     """
     images = [image[:2] for image in images]
     view = view_of(*((image, rays) for image in images))
-    height = 1.2 * len(images) + 0.18
+    height = 1.35 * len(images) + 0.18
     figure = Figure((_WIDTH, height), facecolor="white")
     grid = figure.add_gridspec(
         len(images),
         3,
         width_ratios=[2.6, 0.9, 1.3],
-        hspace=0.12,
+        hspace=0.24,
         wspace=0.13,
         left=0.01,
         right=0.94,
@@ -134,15 +134,8 @@ def contact_sheet(
             for axes in strips:
                 axes.imshow(grey, aspect="auto", interpolation="nearest")
         if row < len(titles):
-            strips[0].text(
-                0.004,
-                0.94,
-                titles[row],
-                transform=strips[0].transAxes,
-                va="top",
-                fontsize=6,
-                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1},
-            )
+            about = f"{titles[row]}: range, m" if label else titles[row]
+            strips[0].set_title(about, fontsize=7, loc="left", pad=2)
     return figure
 
 

@@ -92,11 +92,11 @@ def finish(
         print(f"stopped at step {checkpoint.step}: the same command resumes from here")
     for name, (steps, values) in curves.items():
         tenth = max(len(values) // 10, 1)
-        start = f"{values[:tenth].mean():.4f} first, " if len(values) > 1 else ""
+        start = f"{values[:tenth].mean():#.3g} at first, " if len(values) > 1 else ""
         single = ""
         if tenth == 1 and name.startswith("train/"):
-            single = " (single batches: too few to compare)"
-        print(f"{name}: {start}{values[-tenth:].mean():.4f} at step {steps[-1]}{single}")
+            single = " (noisy: of one batch each)"
+        print(f"{CURVES[name]}: {start}{values[-tenth:].mean():#.3g} at step {steps[-1]}{single}")
     print(f"\ncheckpoint    {checkpoint.path}")
     num = samples["num"]
     if num == 0 or not checkpoint.generator.unconditional:

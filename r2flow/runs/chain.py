@@ -15,6 +15,7 @@ from r2flow.base.registry import Config, Options
 from r2flow.base.signals import LATER, Stopped
 from r2flow.model.lineage import Parent
 from r2flow.model.paths import FOLDER
+from r2flow.reports.chain import link_label
 from r2flow.runs.composing import compose
 from r2flow.stages import STAGES
 from r2flow.training import build, check, fit
@@ -97,10 +98,12 @@ def train_links(links: Sequence[Link], folders: Sequence[str] = ()) -> int:
     stopped, 75.
     """
     for number, link in enumerate(links, 1):
-        print(f"[{number}/{len(links)}] {link.name}: {link.run_dir}", flush=True)
         try:
             with naming(f"chain.{link.name}"):
-                finished = fit(build(compose(link.overrides, folders), link.overrides)).finished
+                config = compose(link.overrides, folders)
+                label = link_label(link.name, config)
+                print(f"[{number}/{len(links)}] {label}: {link.run_dir}", flush=True)
+                finished = fit(build(config, link.overrides)).finished
         except Stopped:
             print(
                 f"the chain stopped in {link.name}; the same command resumes there",

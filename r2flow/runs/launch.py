@@ -225,7 +225,7 @@ def _draw_preview(model: str, out: Path) -> None:
     picture = out / "samples.png"
     if not picture.is_file():
         write_samples(load_checkpoint(find_model(model)), out, num=4, seed=0)
-    print(f"preview: scans of the model {model} in {picture}, point clouds next to it", flush=True)
+    print(f"while you wait: scans of the included model {model}, {picture}", flush=True)
 
 
 def _report_device(trainer: Options) -> str:

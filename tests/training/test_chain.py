@@ -16,7 +16,7 @@ from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.paths import checkpoints_of
 from r2flow.model.saving import weights_hash
 from r2flow.model.tensor_files import read_checkpoint
-from r2flow.reports.chain import _INCLUDED, _advice, _with_distances, report_chain
+from r2flow.reports.chain import _INCLUDED, _conclusion, _scan_sets, _with_distances, report_chain
 from r2flow.runs.chain import links_of
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import has_ended
@@ -52,7 +52,7 @@ def test_a_preview_is_drawn_once_and_before_the_chain(
     )
     for _ in range(2):
         done = in_process(tmp_path, ["experiment=demo", "trainer.accelerator=cpu"], check=False)
-        assert "preview: scans of the model street in runs/demo/preview/samples.png" in done.stdout
+        assert "scans of the included model street, runs/demo/preview/samples.png" in done.stdout
     assert drawn[0] == drawn[1]
 
 
@@ -108,8 +108,10 @@ def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
         "8 pairs",
         "evaluations a pair",
         "pairs/s",
-        "rf1, trained on scans ",
-        "best baseline: ",
+        "[2/3] rf2 (straightened): ",
+        "rf1 (trained on scans)  ",
+        " (best without a network)",
+        "- Best flow: ",
         "r2flow sample",
     ):
         assert words in said
@@ -139,22 +141,31 @@ def test_the_report_s_distance_of_the_held_out_scans_themselves_is_0(chained: tu
     data = ScanDataModule(**first.config["data"], **groups)
     data.read()
     held_out = data.validation_source.batch(range(len(data.validation_source))).numpy()
-    drawn = [({"scans": "street", "calls": 1.0}, held_out), ({"scans": "mine"}, held_out * 0.5)]
-    _, rows = _with_distances(drawn, first)
+    unseen, training = _scan_sets(first)
+    drawn = [({}, held_out), ({}, held_out * 0.5), ({}, training[:].numpy())]
+    rows = _with_distances(drawn, unseen, training)
     exact, halved, trained, baseline = (row["distance"] for row in rows)
     assert exact == 0 < trained < baseline
     assert halved > 0.1
-    assert _with_distances(drawn, second) == ("Scans drawn", [row for row, _ in drawn])  # on pairs
+    assert _scan_sets(second) is None  # on pairs
 
 
-@pytest.mark.parametrize(("distance", "advised"), [(0.1, True), (0.3, False)])
-def test_the_included_model_is_advised_where_it_is_nearer(distance: float, advised: bool):
-    rows = [
-        {"scans": "rf1", "calls": 1.0, "distance": 0.2},
-        {"scans": _INCLUDED, "calls": 2.0, "distance": distance},
-        {"scans": "scans of the training", "distance": 0.01},
+def test_the_conclusion_follows_the_distances():
+    def row(scans: str, distance: float, calls: float = 1.0) -> dict[str, object]:
+        cost = {"solver": "euler", "calls": calls}
+        return {"scans": scans, "title": f"{scans} in {calls:g}", "distance": distance, **cost}
+
+    rows = [row("a", 0.3), row("a", 0.2, 2.0), row("b", 0.1), row("b", 0.205, 2.0)]
+    baseline = {"scans": "noise", "distance": 0.09}
+    told = [
+        "- b in 1 is far better than a: 0.100 against 0.300.",
+        "- b in 2 is about as good as a: 0.205 against 0.200.",
+        "- Best flow: b in 1 is worse than noise: 0.100 against 0.090.",
     ]
-    assert ("r2flow sample street" in _advice(rows)) == advised
+    assert _conclusion([*rows, baseline], 2400) == told
+    included = _conclusion([*rows, row(_INCLUDED, 0.3), baseline], 2400)
+    assert f"- {_INCLUDED} in 1 is far worse than b: 0.300 against 0.100." == included[3]
+    assert "2,400" in included[4]
 
 
 def test_a_finished_chain_is_not_run_again(chained: tuple[Path, str], scans: Path, tmp_path: Path):

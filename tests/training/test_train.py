@@ -93,7 +93,7 @@ def test_a_finished_run_is_not_trained_again(train: Run, copied: Path):
     done = train("name=copied")
     assert "training 12/12" not in done.stderr  # the line of training's progress
     assert "checkpoint" in done.stdout
-    assert "(single batches: too few to compare)" in done.stdout
+    assert "(noisy: of one batch each)" in done.stdout
     torch.testing.assert_close(weights(copied), before, rtol=0, atol=0)
 
 
@@ -311,7 +311,7 @@ def test_a_killed_sweep_takes_its_job_with_it(scans: Path, tmp_path: Path, by: i
 
 def test_a_run_shorter_than_the_interval_is_validated_at_its_end(train: Run):
     _, summary, progress = train("trainer.max_steps=1", "samples.num=0")
-    assert "val/loss: " in summary
+    assert "validation loss: " in summary
     assert "training 1/1 steps" in progress
 
 
