@@ -82,7 +82,7 @@ def prepare(
     shard_scans: Annotated[int, Option(min=1, help="Scans per shard.")] = 64,
     workers: WorkersOption = None,
 ) -> None:
-    """Project a data set into shards for training: range in 2 bytes, reflectance in 1.
+    """Project a data set into shards for training: range in 2 bytes, reflectance and labels in 1.
 
     The same command resumes an interrupted run, shares the work with others at the same time and
     replaces damaged shards. Train on them with python train.py data=prepared data.root=FOLDER.
@@ -107,6 +107,8 @@ def prepare(
         f"{size / 2**20:.1f} MiB",
         f"reflectance as n/{levels}" if levels else "no reflectance",
     ]
+    if store.reading.labels:
+        notes.append("labels")
     if there:
         notes.append(f"{there} there already")
     if left_out:

@@ -70,7 +70,6 @@ class Prepared(SourceKind):
         options = scans.options
         store = read_prepared(options.folder)
         refuse_other_images(store, reading)
-        check(not reading.labels, f"{options.folder}: prepared scans have no labels.")
         layout = store.described["layout"]
         kind = SOURCES[layout if layout in SOURCES else FOLDER]
         if options.split is None and options.drives is None:
@@ -84,7 +83,7 @@ class Prepared(SourceKind):
         place = {name: number for number, name in enumerate(store.names)}
         chosen = kind.chosen(store.drives, options.split, options.drives)
         numbers = [place[name] for drive in chosen for name in drive.scans]
-        return PreparedScans(store, numbers, bool(reading.reflectance))
+        return PreparedScans(store, numbers, bool(reading.reflectance), reading.labels)
 
     def lacks_reflectance(self, scans: "Described", on_bad_scan: str = "error") -> str | None:
         if self.levels_of(scans) is None:
@@ -152,7 +151,7 @@ class Described:
             return None
         stored = Reading.of(described)
         if self.options.name == PREPARED:
-            stored = replace(stored, reflectance=AUTO, within_limits=False)
+            stored = replace(stored, reflectance=AUTO, labels=False, within_limits=False)
         return stored
 
     @cached_property

@@ -4,7 +4,8 @@
     source[0]                       range in metres and reflectance, (2, H, W)
 
 A shard is an item of `r2flow.store`: `range` uint16 (n, H, W) and, if the scans have it,
-`reflectance` uint8 (n, H, W), in the codes of `r2flow.data.quantise`.
+`reflectance` uint8 (n, H, W), in the codes of `r2flow.data.quantise`; if each scan has a file of
+labels, `label` uint8 (n, H, W), the common class.
 """
 
 import copy
@@ -26,7 +27,7 @@ from r2flow.base.errors import InputError, check
 from r2flow.base.files import reading_errors
 from r2flow.base.progress import Bar, track
 from r2flow.data.layouts import Drive
-from r2flow.data.quantise import OTHER_LEVELS, find_levels, range_codes, reflectance_codes
+from r2flow.data.quantise import OTHER_LEVELS, Codes, find_levels, range_codes, reflectance_codes
 from r2flow.data.reading import Reading, lacks_reflectance, read_image
 from r2flow.data.sources import (
     ScanFiles,
@@ -35,6 +36,7 @@ from r2flow.data.sources import (
     spread,
     warn_of_other_sensor,
 )
+from r2flow.lidar.labels import labels_beside
 from r2flow.store import MANIFEST, Damaged, Store, checksum, read_manifest
 
 log = logging.getLogger(__name__)
@@ -51,8 +53,8 @@ class PreparedStore(Store):
         source: The scans to prepare; None of a folder that is only read.
         reading: How the scans became images.
         parts: The numbers of each shard's scans.
-        codes: The codes of range and, if the scans have it, of reflectance, by the name of their
-            tensor.
+        codes: The codes of range and, if the scans have them, of reflectance and labels, by the
+            name of their tensor.
     """
 
     def __init__(
@@ -76,6 +78,8 @@ class PreparedStore(Store):
         self.codes = {"range": range_codes(sensor.min_range, sensor.max_range)}
         if levels is not None:
             self.codes["reflectance"] = reflectance_codes(levels)
+        if self.reading.labels:
+            self.codes["label"] = Codes([0, 255], [0, 255], np.uint8)
         self.shards = range(len(self.parts))
 
     @cached_property
@@ -107,7 +111,9 @@ def plan_files(
     reading = replace(reading, on_bad_scan="error", within_limits=True)
     warn_of_other_sensor(paths, reading, root)
     levels = _reflectance_levels(paths, reading)
-    reading = replace(reading, reflectance=levels is not None)
+    # Range images have no labels.
+    labels = all(not path.endswith(".npy") and labels_beside(path) for path in paths)
+    reading = replace(reading, reflectance=levels is not None, labels=labels)
     names = [name for drive in named for name in drive.scans]
     recipe = {
         "revision": PROJECTION, "layout": layout, "scans": len(names), "names": checksum(names),
@@ -224,12 +230,24 @@ class PreparedScans(ScanSource):
     preparation.
     """
 
-    def __init__(self, store: PreparedStore, numbers: Sequence[int], reflectance: bool) -> None:
+    def __init__(
+        self,
+        store: PreparedStore,
+        numbers: Sequence[int],
+        reflectance: bool,
+        labels: bool = False,
+    ) -> None:
         self.store = store
         self.reflectance = reflectance
+        self.channels = ["range", *["reflectance"] * reflectance, *["label"] * labels]
         if reflectance and "reflectance" not in store.codes:
             raise InputError(
                 f"{store.folder} holds scans without reflectance. Set encoding.reflectance=false."
+            )
+        if labels and "label" not in store.codes:
+            raise InputError(
+                f"{store.folder} holds scans without labels. Prepare points that each have a "
+                "file of labels, such as a --split or --drives of the data set."
             )
         places: dict[int, tuple[int, int]] = {}
         for shard, numbers_of_shard in enumerate(store.parts):
@@ -276,7 +294,7 @@ class PreparedScans(ScanSource):
 
     def identity(self) -> dict[str, Any]:
         rows = checksum(self.rows.tolist())
-        return {"recipe": self.contents, "rows": rows, "reflectance": self.reflectance}
+        return {"recipe": self.contents, "rows": rows, "channels": self.channels}
 
     @cached_property
     def contents(self) -> str:  # type: ignore[override]
@@ -297,9 +315,9 @@ class PreparedScans(ScanSource):
             path = self.store.files(shard)[0]
             with reading_errors(path):  # damaged since it was opened
                 file = safe_open(path, framework="numpy")
-                self._shards[shard] = {name: file.get_slice(name) for name in self.store.codes}
+                self._shards[shard] = {name: file.get_slice(name) for name in self.channels}
         channels = []
-        for name, stored in [*self._shards[shard].items()][: 1 + self.reflectance]:
+        for name, stored in self._shards[shard].items():
             code = stored[row : row + 1][0]
             # No index is out of bounds; mode="clip" only skips the bounds check.
             channels.append(np.take(self.store.codes[name].values, code, mode="clip"))

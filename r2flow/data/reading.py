@@ -203,6 +203,8 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
         )
     if len(image) < channels:
         raise _no_reflectance(path)
+    if reading.labels:
+        raise InputError(f"{path} is a range image, which has no labels: give points, as .bin.")
     image = image[:channels]
     if not reading.within_limits:
         return image

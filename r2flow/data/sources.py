@@ -26,7 +26,7 @@ from r2flow.base.files import cache_folder
 from r2flow.base.progress import track
 from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
 from r2flow.lidar.estimation import Doubt, differing, in_words, is_unclear, other_sensor
-from r2flow.lidar.labels import common_classes
+from r2flow.lidar.labels import common_classes, labels_beside
 from r2flow.lidar.scan_files import Points, read_points, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.turns import SEVERAL, turns
@@ -263,15 +263,19 @@ class ScanFiles(ScanSource):
         """
         stats = []
         hashes = []
-        for name, path in zip(self.names, self.paths, strict=True):
+        paths = [*self.paths]
+        if self.reading.labels:
+            paths += [found for path in paths if (found := labels_beside(path))]
+        for path in paths:
             with suppress(OSError):  # reported when the scan is read
                 stat = os.stat(path)
+                name = str(path).removeprefix(os.path.join(self.root, ""))
                 stats.append((name, stat.st_size, *[stat.st_mtime_ns] * times))
         # Hash some contents, too: unpacked archives can have equal names, sizes and times.
-        for i in spread(len(self.paths), 8):
+        for i in spread(len(paths), 8):
             with suppress(OSError):
-                if os.path.isfile(self.paths[i]):  # a pipe would block, a device never end
-                    with open(self.paths[i], "rb") as file:
+                if os.path.isfile(paths[i]):  # a pipe would block, a device never end
+                    with open(paths[i], "rb") as file:
                         hashes.append(hashlib.file_digest(file, "sha256").hexdigest())
         return hashlib.sha256(json.dumps([stats, hashes]).encode()).hexdigest()
 

@@ -15,6 +15,7 @@ import yaml
 from safetensors.numpy import load_file
 
 from r2flow.base.errors import InputError
+from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.layouts import Drive
 from r2flow.data.opening import SOURCES, Described, find_drives
 from r2flow.data.options import SourceOptions
@@ -22,6 +23,7 @@ from r2flow.data.prepared import PreparedStore, plan_files, prepare, refuse_othe
 from r2flow.data.quantise import find_levels, range_codes, reflectance_codes
 from r2flow.data.reading import Reading, read_image
 from r2flow.data.sources import ScanFiles
+from r2flow.lidar.labels import COMMON
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.store import MANIFEST, read_manifest
@@ -476,3 +478,34 @@ def test_a_run_is_told_the_columns_too(wide, tmp_path):
     given = [*TINY, f"data.root={wide}", "trainer.max_steps=1", "trainer.fast_dev_run=true"]
     in_process(tmp_path, [*given, "data.reading.columns=[_,z,y,x,intensity,_]"])
     assert "6 columns, no" in in_process(tmp_path, given, check=False).refusal
+
+
+def test_labels_are_kept_where_each_scan_has_them(r2flow, clouds: Path, tmp_path: Path):
+    root = Path(shutil.copytree(clouds, tmp_path / "scans"))
+    scans = sorted(root.rglob("*.bin"))
+    for number, scan in enumerate(scans):
+        ids = np.random.default_rng(number).choice([0, 40, 48, 10, 252, 99], 200)
+        scan.with_suffix(".label").write_bytes(ids.astype("<u4").tobytes())
+    out = tmp_path / "out"
+    typed = "prepare", root, "--out", out, "--size", "4x16", "--shard-scans", 4, "--workers", 1
+    assert "reflectance as n/256, labels" in r2flow(*typed).said
+    prepared = prepared_in(out, labels=True)
+    plain = prepared_in(make(tmp_path / "plain", plan_of(clouds)))
+    for number, scan in enumerate(scans):
+        labelled = read_image(scan, Reading(SMALL, reflectance=True, labels=True))
+        assert set(np.unique(labelled[2])) == {0, 1, 2, 6, 8}
+        assert np.array_equal(prepared[number][2], labelled[2])
+        assert np.array_equal(prepared[number][:2], plain[number])
+        assert np.array_equal(prepared_in(out)[number], plain[number])
+    encoding = {"reflectance": True, "labels": True}
+    data = ScanDataModule("prepared", root=str(out), sensor=SMALL, encoding=encoding, batch_size=4)
+    data.setup()
+    assert next(iter(data.train_dataloader()))["x_1"].shape == (4, 2 + len(COMMON), 4, 16)
+    other = ScanDataModule("prepared", root=f"{tmp_path}/plain", sensor=SMALL, encoding=encoding)
+    with refused("plain holds scans without labels. Prepare points that each have a file of"):
+        other.setup()
+    # Changed labels are refused as changed scans are.
+    scans[0].with_suffix(".label").write_bytes(bytes(800))
+    assert "scans-000000.safetensors holds scans of other files" in r2flow(*typed).refusal
+    scans[0].with_suffix(".label").unlink()
+    assert "label" not in plan_of(root).codes
