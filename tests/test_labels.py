@@ -199,6 +199,9 @@ def test_a_labelled_flow_trains_on_labelled_scans_of_each_kind(tmp_path: Path):
     (tmp_path / "1.label").unlink()
     with pytest.raises(InputError, match=r"1\.bin has no labels"):
         read_image(tmp_path / "1.bin", Reading(SENSOR, labels=True))
+    np.save(tmp_path / "0.npy", image[:2])
+    of_image = read_image(tmp_path / "0.npy", Reading(SENSOR, labels=True))
+    np.testing.assert_array_equal(of_image[2], image[2])
     np.save(tmp_path / "2.npy", image[:2])
     with pytest.raises(InputError, match=r"2\.npy is a range image, which has no labels"):
         read_image(tmp_path / "2.npy", Reading(SENSOR, labels=True))

@@ -37,6 +37,7 @@ from r2flow.data.sources import (
     warn_of_other_sensor,
 )
 from r2flow.lidar.labels import labels_beside
+from r2flow.lidar.scan_files import points_beside
 from r2flow.store import MANIFEST, Damaged, Store, checksum, read_manifest
 
 log = logging.getLogger(__name__)
@@ -111,8 +112,10 @@ def plan_files(
     reading = replace(reading, on_bad_scan="error", within_limits=True)
     warn_of_other_sensor(paths, reading, root)
     levels = _reflectance_levels(paths, reading)
-    # Range images have no labels.
-    labels = all(not path.endswith(".npy") and labels_beside(path) for path in paths)
+    # A range image alone has no labels.
+    labels = all(
+        labels_beside(path) and points_beside(Path(path)).suffix != ".npy" for path in paths
+    )
     reading = replace(reading, reflectance=levels is not None, labels=labels)
     names = [name for drive in named for name in drive.scans]
     recipe = {

@@ -13,7 +13,13 @@ from r2flow.base.errors import InputError, naming, warn_odd
 from r2flow.lidar.estimation import FULL_REFLECTANCE, OUTLIERS, SURE, full_reflectance
 from r2flow.lidar.labels import common_classes, labels_beside, read_labels
 from r2flow.lidar.projection import Convention, Projection, project_indices, scatter
-from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
+from r2flow.lidar.scan_files import (
+    NoPointsError,
+    Points,
+    points_beside,
+    read_points,
+    read_range_image,
+)
 from r2flow.lidar.sensors import Sensor
 from r2flow.store import manifest_of
 
@@ -190,8 +196,13 @@ def scaled_reflectance(
 
 
 def read_image(path: Path, reading: Reading) -> np.ndarray:
-    """Read a scan file or a range image as an image, (2 or 1, H, W)."""
+    """Read a scan file or a range image as an image, (2 or 1, H, W), and with labels a class more.
+
+    Labels are those of points: of a range image, of the file of points next to it.
+    """
     channels = 1 + bool(reading.reflectance)
+    if reading.labels:
+        path = points_beside(path)
     image = read_range_image(path)
     if image is None:
         return _with_labels(path, reading) if reading.labels else read_projected(path, reading)[0]
@@ -204,7 +215,7 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
     if len(image) < channels:
         raise _no_reflectance(path)
     if reading.labels:
-        raise InputError(f"{path} is a range image, which has no labels: give points, as .bin.")
+        raise InputError(f"{path} is a range image, which has no labels: give points.")
     image = image[:channels]
     if not reading.within_limits:
         return image
