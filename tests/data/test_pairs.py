@@ -242,7 +242,7 @@ def test_pairs_of_a_run_lie_in_its_folder(r2flow, saved):
     for words in (
         "12 pairs",
         "pairs/s",
-        "2.0 evaluations a pair",
+        "2 evaluations a pair",
         f"{folder}: all 10 pairs, 1 shard",
     ):
         assert words in said
