@@ -24,6 +24,11 @@ IMAGE = "image"
 KNOWN = "known"
 
 
+def holds(condition: Tensor) -> bool:
+    """Whether a condition, () bool, is true; an exported graph has no branches: True."""
+    return torch.compiler.is_exporting() or bool(condition)
+
+
 def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
     """Condition of partial scans: `image` and `known`, each (B, C, H, W) in model space.
 
@@ -50,7 +55,7 @@ def condition_of(space: ModelSpace, images: Tensor, state: Tensor) -> Condition:
         )
     measured = state != Ray.UNKNOWN
     expected = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.EMPTY))
-    if (measured & (state != expected)).any():
+    if not holds((~measured | (state == expected)).all()):
         raise InputError(
             "a ray's state must be Ray.RETURN for a range above 0, Ray.EMPTY for a measured range "
             "of 0, and Ray.UNKNOWN for a ray that was not measured."

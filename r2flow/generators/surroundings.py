@@ -181,13 +181,16 @@ def within_reach(known: Tensor) -> Tensor:
 
     `known` is (B, 1, H, W).
     """
-    reach = known[:, 0].any(2)
-    number = torch.arange(known.shape[2], device=known.device)
-    for rows in reach:
-        measured = rows.nonzero()
-        if len(measured):
-            gap = measured.diff(dim=0).amax() if len(measured) > 1 else len(rows)
-            rows.copy_((number > measured[0] - gap) & (number < measured[-1] + gap))
+    measured = known[:, 0].any(2)
+    rows = measured.shape[1]
+    number = torch.arange(rows, device=known.device)
+    first = torch.where(measured, number, 2 * rows).amin(1, True)
+    last = torch.where(measured, number, -rows).amax(1, True)
+    earlier = measured[:, None] & (number < number[:, None])
+    before = torch.where(earlier, number, -1).amax(2)
+    gap = torch.where(measured & (before >= 0), number - before, 0).amax(1, True)
+    gap = torch.where(gap > 0, gap, rows)
+    reach = (number > first - gap) & (number < last + gap)
     return reach[:, None, :, None]
 
 
@@ -273,7 +276,18 @@ def _before(returned: Tensor, steps: Tensor, turning: bool, ring: bool) -> Tenso
     """
     rows = returned.shape[1]
     blocks = max(n for n in range(1, math.isqrt(rows) + 1) if rows % n == 0) if rows > _FEW else 1
-    parts = returned.unflatten(1, (blocks, -1)).unbind(2)
+    blocked = returned.unflatten(1, (blocks, -1)).movedim(2, 0)  # (L, B, blocks, W)
+    if torch.compiler.is_exporting():  # its steps would be a graph of thousands of nodes
+        shape = (len(blocked), 2, *blocked.shape[1:])
+        found = torch.onnx.ops.symbolic(
+            "r2flow::Before",
+            (blocked, steps),
+            {"turning": int(turning), "ring": int(ring)},
+            dtype=steps.dtype,
+            shape=shape,
+        )
+        return found.movedim(0, 3).flatten(2, 3)
+    parts = blocked.unbind()
     missing = steps.new_full((2, *parts[0].shape), math.inf)
     start = missing
     for _ in range(2 * blocks):  # at most two turns

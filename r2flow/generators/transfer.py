@@ -18,7 +18,15 @@ from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.path import expand_time
 from r2flow.flow.solvers.solution import wide
 from r2flow.generators.answers import FAINT, NEVER, Answers, smoothed
-from r2flow.generators.base import IMAGE, KNOWN, Condition, Generated, Generator, autocast
+from r2flow.generators.base import (
+    IMAGE,
+    KNOWN,
+    Condition,
+    Generated,
+    Generator,
+    autocast,
+    holds,
+)
 from r2flow.generators.flow import Conditioned, Flow
 from r2flow.generators.surroundings import (
     FEATURES,
@@ -151,7 +159,7 @@ class TransferFlow(Flow):
         """
         inputs = self._inputs(x, about, rows)
         output = self.backbone(t, inputs).float()
-        if self.foreign and bool((about.sure == 0).any()):
+        if self.foreign and holds((about.sure == 0).any()):
             elevation = x.shape[1] - self.classes + FEATURES + ROW
             inputs[:, elevation] += STEEP * _RAISED
             output[:, _RETURN] = self.backbone(t, inputs).float()[:, _RETURN]
@@ -206,7 +214,7 @@ class TransferFlow(Flow):
         assert condition is not None
         t = torch.as_tensor(t, device=x.device, dtype=torch.float32)
         answers = self._answered(t, x, condition)
-        estimate = self._chosen if bool((torch.as_tensor(s) >= 1).all()) else self._mean
+        estimate = self._chosen if holds((torch.as_tensor(s) >= 1).all()) else self._mean
         x_1 = _with_known(condition, estimate(answers)).to(x)
         return ((x_1 - x) / (1 - expand_time(t, x)).clamp(min=_LAST)).to(x)
 
@@ -304,7 +312,8 @@ class TransferFlow(Flow):
         known = condition[KNOWN].to(weight)
         measured = {IMAGE: image, KNOWN: known}
         gain = torch.ones_like(image[:, :1, :1, :1])
-        if self.space.encoding.reflectance and self.foreign:
+        scaled = self.space.encoding.reflectance and self.foreign
+        if scaled:
             # Its intensities have another scale than those that the network has seen.
             gain = gain_of(self.space, image, known)
         elevations = self.elevations.to(weight)[None].expand(len(image), -1)
@@ -314,8 +323,8 @@ class TransferFlow(Flow):
         measured["rows"] = self.rows(elevations, steps, numbered)
         noise = self.sigma * noise.to(weight)
         measured |= {"gain": gain, "share": torch.ones_like(gain)}
-        hidden = bool((known[:, :1] < 1).any())  # else labels alone are drawn
-        tested = hidden and bool((gain != 1).any())
+        hidden = holds((known[:, :1] < 1).any())  # else labels alone are drawn
+        tested = scaled and hidden and holds((gain != 1).any())
         if tested:
             with autocast(self.device, how.get("precision", "32-true")):
                 measured["share"] = self._share(measured, noise, steps)

@@ -9,7 +9,80 @@ import torch
 from onnx import TensorProto
 from onnx.compose import add_prefix
 from onnx.helper import make_graph, make_model, make_node, make_tensor_value_info
+from onnx.inliner import inline_local_functions
 from onnx.numpy_helper import from_array
+from onnx.parser import parse_function
+
+# `r2flow.generators.surroundings._before` of `parts`, (L, B, blocks, W), in which row `l` of each
+# block follows row `l - 1`; a sweep is repeated until the blocks' first rows stay.
+BEFORE = parse_function("""
+<domain: "r2flow", opset_import: ["" : 18]>
+Before <turning, ring> (parts, steps) => (offsets) {
+  front = Constant <value = int64[1] {0}> ()
+  one = Constant <value = int64[1] {1}> ()
+  two = Constant <value = int64[1] {2}> ()
+  three = Constant <value = int64[1] {3}> ()
+  back = Constant <value = int64[1] {-1}> ()
+  before_back = Constant <value = int64[1] {-2}> ()
+  most = Constant <value = int64[1] {9223372036854775807}> ()
+  zero = Constant <value = float {0}> ()
+  true = Constant <value = bool {1}> ()
+  moves = Constant <value = float[3,2,1,1,1] {-1, -1, -1, 0, -1, 1}> ()
+  log_zero = Log (zero)
+  far = Neg (log_zero)
+  turning_number = Constant <value_int: int = @turning> ()
+  turns = Cast <to = 9> (turning_number)
+  ring_number = Constant <value_int: int = @ring> ()
+  closed = Cast <to = 9> (ring_number)
+  part = Gather (parts, front)
+  both = Concat <axis = 0> (part, part)
+  shape = Shape (both)
+  start = Expand (far, shape)
+  offsets_0 = Unsqueeze (start, front)
+  end, offsets = Loop (, true, start, offsets_0) <body = sweeps (
+    int64 number, bool going, float[2, b, k, w] state_0, float[l, 2, b, k, w] rows_0
+  ) => (bool more, float[2, b, k, w] state_1, float[l, 2, b, k, w] rows_1) {
+    last, rows_1 = Scan <num_scan_inputs = 1, body = row (
+      float[2, b, k, w] state, bool[b, k, w] own
+    ) => (float[2, b, k, w] next, float[2, b, k, w] same) {
+      same = Identity (state)
+      kept = Where (own, zero, state)
+      first_column = Slice (kept, front, one, three)
+      last_column = Slice (kept, back, most, three)
+      left = Where (closed, last_column, far)
+      right = Where (closed, first_column, far)
+      wide = Concat <axis = 3> (left, kept, right)
+      a = Slice (wide, front, before_back, three)
+      c = Slice (wide, two, most, three)
+      a_first = Unsqueeze (a, front)
+      b_first = Unsqueeze (kept, front)
+      c_first = Unsqueeze (c, front)
+      stay = Concat <axis = 0> (a_first, b_first, c_first)
+      moved = Add (stay, moves)
+      angles = Mul (moved, steps)
+      squares = Mul (angles, angles)
+      square = ReduceSum (squares, one)
+      moved_0, moved_1, moved_2 = Split <axis = 0, num_outputs = 3> (moved)
+      square_0, square_1, square_2 = Split <axis = 0, num_outputs = 3> (square)
+      nearer_1 = Less (square_1, square_0)
+      best_1 = Where (nearer_1, moved_1, moved_0)
+      least = Min (square_1, square_0)
+      nearer_2 = Less (square_2, least)
+      best_2 = Where (nearer_2, moved_2, best_1)
+      next = Squeeze (best_2, front)
+    }> (state_0, parts)
+    below = Slice (last, back, most, two)
+    first = Where (turns, below, far)
+    others = Slice (last, front, back, two)
+    state_1 = Concat <axis = 2> (first, others)
+    equal = Equal (state_1, state_0)
+    equal_number = Cast <to = 6> (equal)
+    all = ReduceMin <keepdims = 0> (equal_number)
+    all_equal = Cast <to = 9> (all)
+    more = Not (all_equal)
+  }>
+}
+""")
 
 
 def to_onnx(
@@ -32,10 +105,24 @@ def to_onnx(
     for value in (*graph.input, *graph.output):
         del value.metadata_props[:]
         sizes = value.type.tensor_type.shape.dim
-        if len(sizes) and sizes[0].dim_param:
+        if len(sizes) and sizes[0].dim_param[:1] not in ("", "u"):  # u: of the outputs alone
             sizes[0].dim_param = "batch"
     for node in graph.node:
         del node.metadata_props[:]  # source locations in torch and r2flow
+    if any(node.domain == BEFORE.domain for node in graph.node):
+        model = _inlined(model)
+    return model
+
+
+def _inlined(model: onnx.ModelProto) -> onnx.ModelProto:
+    """The model with `BEFORE` in place of the nodes that call it."""
+    function = model.functions.add()
+    function.CopyFrom(BEFORE)
+    versions = {opset.domain: opset for opset in model.opset_import}
+    function.opset_import[0].CopyFrom(versions[""])
+    model = inline_local_functions(model)
+    del model.opset_import[:]
+    model.opset_import.append(versions[""])
     return model
 
 
