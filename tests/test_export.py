@@ -15,8 +15,17 @@ from r2flow.backbones import BACKBONES
 from r2flow.base.errors import InputError
 from r2flow.base.noise import Draws
 from r2flow.generators import RectifiedFlow, build_generator
+from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.model.export import NOTES, _traced, compare, export, tableau
+from r2flow.model.export import (
+    NOTES,
+    _traced,
+    compare,
+    compare_completion,
+    export,
+    export_completion,
+    tableau,
+)
 from r2flow.samplers import build_sampler
 from tests.conftest import ROOT, tiny_options
 
@@ -204,3 +213,62 @@ def test_a_flow_map_goes_through_the_loop_and_the_page_s_program_runs(tmp_path, 
         np.linalg.norm(cloud, axis=1), scan[0][scan[0] > 0], rtol=1e-5, atol=1e-4
     )
     assert names["notes"]["evaluations"] == 3
+
+
+@ONNX
+@pytest.mark.parametrize(("turning", "ring", "rows"), [(False, True, 60), (True, False, 132)])
+def test_nearest_returns_are_those_of_torch(turning, ring, rows):
+    import onnxruntime
+    from onnx.helper import make_graph, make_model, make_node, make_opsetid, make_tensor_value_info
+
+    from r2flow.generators.surroundings import _before
+    from r2flow.model.onnx_graphs import BEFORE
+
+    returned = torch.rand(2, rows, 16) < 0.03
+    returned[:, rows // 3 : rows // 2] = False
+    blocks = 1 if rows == 60 else 11
+    parts = returned.unflatten(1, (blocks, -1)).movedim(2, 0).numpy()
+    steps = torch.tensor([0.8, 0.6, 0.3, 0.4]).view(2, 2, 1, 1)
+    how = {"turning": int(turning), "ring": int(ring), "domain": BEFORE.domain}
+    node = make_node("Before", ["parts", "steps"], ["offsets"], **how)
+    shapes = {"parts": (9, parts.shape), "steps": (1, steps.shape)}
+    inputs = [make_tensor_value_info(name, *value) for name, value in shapes.items()]
+    output = make_tensor_value_info("offsets", 1, None)
+    versions = [make_opsetid("", 18), make_opsetid(BEFORE.domain, 1)]
+    graph = make_graph([node], "before", inputs, [output])
+    model = make_model(graph, opset_imports=versions, functions=[BEFORE], ir_version=10)
+    session = onnxruntime.InferenceSession(model.SerializeToString())
+    (found,) = session.run(None, {"parts": parts, "steps": steps.numpy()})
+    offsets = torch.from_numpy(found).movedim(0, 3).flatten(2, 3)
+    assert torch.equal(offsets, _before(returned, steps, turning, ring))
+
+
+@ONNX
+@pytest.mark.slow
+def test_an_exported_completion_is_that_of_the_flow(tmp_path):
+    import onnxruntime
+
+    checkpoint = flow("local", "transfer_flow")
+    source = SENSORS["hdl64e"].resized(8, 128)
+    written = export_completion(checkpoint, tmp_path / "flow.onnx", source)
+    apart = compare_completion(checkpoint, written, source)
+    assert apart.metres < 1e-3
+    assert apart.reflectance < 1e-3
+    assert apart.rays <= 1
+    e, a = source.rays().numpy()
+    xyz = 9 * np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)]).reshape(3, -1)
+    points = np.vstack([xyz, np.full_like(xyz[:1], 0.5)]).T
+    session = onnxruntime.InferenceSession(written.path)
+    scan, completed, measured = session.run(None, {"points": points})
+    assert scan.shape == (2, 16, 64)
+    assert set(map(tuple, completed[measured])) <= set(map(tuple, points))
+    ranges = np.linalg.norm(completed[:, :3], axis=1)
+    np.testing.assert_allclose(np.sort(ranges), np.sort(scan[0][scan[0] > 0]), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("flow.pt2", "is exported as .onnx"), ("flow.onnx", "have all rows")]
+)
+def test_a_completion_that_cannot_be_exported_is_refused(name, words, tmp_path):
+    with pytest.raises(InputError, match=words):
+        export_completion(flow("local", "transfer_flow"), tmp_path / name, SENSORS["hdl64e"])

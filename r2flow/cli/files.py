@@ -4,13 +4,16 @@ import logging
 from hashlib import sha256
 from json import dumps as to_json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from typer import Argument, Option
 
-from r2flow.base.errors import InputError, check_folder
+from r2flow.base.errors import InputError, check, check_folder
 from r2flow.cli.app import app
-from r2flow.cli.options import ModelArgument, SamplerOptions, grouped
+from r2flow.cli.options import ModelArgument, SamplerOptions, SizeOption, grouped
+
+if TYPE_CHECKING:
+    from r2flow.model.checkpoint import Checkpoint
 
 _LABELS = {"few": "in fewer steps"}  # of `info`
 
@@ -31,6 +34,11 @@ def export(
         Literal["sampler", "network"],
         Option(help="sampler: noise to scan; network: only v(t, x)."),
     ] = "sampler",
+    source: Annotated[
+        str | None,
+        Option("--from", help="Of densify: sensor of the scans to complete, name or YAML file."),
+    ] = None,
+    size: SizeOption = None,
     half: Annotated[
         bool,
         Option(
@@ -43,12 +51,12 @@ def export(
     ] = None,
 ) -> None:
     """Export a flow as a file that runs without r2flow: from noise to range in metres, reflectance
-    and points.
+    and points; densify: from the points of a scan to those of the completed one.
 
     The file has a fixed number of steps; r2flow runs it and compares it with the flow. --to
     safetensors writes the averaged weights, config and sampler of any generator, reproducibly.
     """
-    from r2flow.generators import RectifiedFlow
+    from r2flow.generators import RectifiedFlow, TransferFlow
     from r2flow.model import export as writing
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.model.saving import save_checkpoint
@@ -67,16 +75,37 @@ def export(
         digest = sha256(out.read_bytes()).hexdigest()
         print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, SHA-256 {digest}")
         return
+    logging.getLogger("r2flow.model.export").setLevel(logging.INFO)
+    if isinstance(loaded.generator, TransferFlow):
+        if source is None:
+            raise InputError("name the sensor of the scans: --from vlp16, or its YAML file.")
+        check(not (network or how.given), "densify is exported whole, as one jump.")
+        _export_completion(loaded, out, source, size)
+        return
+    check(not (source or size), "--from and --size are for models that complete, as densify.")
     # Other generators are refused whatever their sampler.
     sampler = None
     if isinstance(loaded.generator, RectifiedFlow):
         sampler = loaded.generator.choose(**how.given)
-    logging.getLogger("r2flow.model.export").setLevel(logging.INFO)
     written = writing.export(loaded, out, sampler, network)
     content = "the network v(t, x)" if network else sampler
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {content}")
     if not network:
         print(f"compared with the flow: {writing.compare(loaded, written, sampler)}")
+
+
+def _export_completion(model: "Checkpoint", out: Path, source: str, size: Any) -> None:
+    """Export a transfer flow for scans of a sensor, completed in the view of `complete`."""
+    from r2flow.data.partial import seeing_all
+    from r2flow.lidar.sensors import named_sensor
+    from r2flow.model.export import compare_completion, export_completion
+
+    sensor = named_sensor(source)
+    view = named_sensor(model.sensor, size)
+    model = model.through(seeing_all(sensor, view) or view)
+    written = export_completion(model, out, sensor)
+    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, scans of {sensor.name} to {model.sensor}")
+    print(f"compared with the flow: {compare_completion(model, written, sensor)}")
 
 
 @app.command(

@@ -136,7 +136,7 @@ def _files(
         by_points = lambda path: see(path, read_points(path, reading.columns))  # noqa: E731
     elif source and not source.same_image(target):
         lines += _described(spec, source, target)
-        whole = _seeing_all(source, target)
+        whole = seeing_all(source, target)
 
     def opened(path: Path) -> PartialScan:
         ending = scan_ending(path.name) or path.suffix
@@ -197,7 +197,7 @@ def sight(
     if not as_own:
         name = source.name if source else (doubt and doubt.name) or "a sensor"
         lines = _described(spec, replace(fired, name=name), target, turns=True)
-        whole = _seeing_all(source or fired, target)
+        whole = seeing_all(source or fired, target)
     if not (scale or stored) and full != usual and (of_sensor or full not in SURE):
         warn_odd(path, DIVIDED % full)
     return see, lines, whole
@@ -226,7 +226,7 @@ def _images(
     return [opened(number) for number in spread(len(scans), most or len(scans))], lines
 
 
-def _seeing_all(source: Sensor, target: Sensor) -> Sensor | None:
+def seeing_all(source: Sensor, target: Sensor) -> Sensor | None:
     """A sensor with at least the target's rows and with its columns that sees all beams of the
     source, and as near; None if the target sees all beams.
     """
