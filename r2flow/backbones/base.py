@@ -99,7 +99,7 @@ class Backbone(ExactBuffers):
         s = t.
         """
         t = _times(t, x)
-        s = t if s is None else _times(s, x)
+        s = None if s is None else _times(s, x)
         if self.data_std is None and self.prediction == "velocity":
             return self._velocity(t, x, s).to(x.dtype)
         image = at_least_float32(x[:, : self.out_channels])
@@ -111,7 +111,7 @@ class Backbone(ExactBuffers):
             inner = torch.cat([into * image, x[:, self.out_channels :]], dim=1)
         return (skip * image + out * self._velocity(t, inner, s)).to(x.dtype)
 
-    def _velocity(self, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
+    def _velocity(self, t: Tensor, x: Tensor, s: Tensor | None) -> Tensor:
         y = x.to(next(self.parameters()).dtype)
         v = self.velocity(t, y, s) if self.second_time else self.velocity(t, y)
         # not len(x), which torch.export would take for a constant
@@ -139,7 +139,7 @@ class Backbone(ExactBuffers):
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
         """The field for t of shape (B,), or (1,) for the whole batch, in float32 or better.
 
-        Only networks with a second time get s, of the same dtype, (B,) or (1,).
+        Only networks with a second time get s, of the same dtype, (B,) or (1,); None: s = t.
         """
         raise NotImplementedError
 

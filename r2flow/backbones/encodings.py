@@ -31,18 +31,20 @@ class Rotary(ExactBuffers):
         self.freqs_w = frequencies(highest[1])
 
     def table(self, rays: Tensor) -> Tensor:
-        """cos theta and sin theta, (2, H, W, 1, N, D / 2), for rays (1, 2, H, W)."""
+        """cos theta twice, then -sin theta and sin theta, (2, H, W, 1, N, D), for rays (1, 2, H,
+        W).
+        """
         e, a = rays[0, :, :, :, None, None]
         theta = torch.cat([e * self.freqs_h, a * self.freqs_w], dim=-1)
-        return torch.stack([theta.cos(), theta.sin()]).unsqueeze(-3)
+        cos = theta.cos()
+        sin = theta.sin()
+        return torch.stack([torch.cat([cos, cos], -1), torch.cat([-sin, sin], -1)]).unsqueeze(-3)
 
 
 def rotate(x: Tensor, table: Tensor) -> Tensor:
     """Rotate each pair (x_i, x_{i + D/2}) by theta_i; x (..., N, D), table of `Rotary`."""
     cos, sin = table
-    first, second = x.chunk(2, dim=-1)
-    rotated_first = torch.addcmul(first * cos, second, sin, value=-1)
-    return torch.cat([rotated_first, torch.addcmul(second * cos, first, sin)], dim=-1)
+    return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, -1), sin)
 
 
 class RayEncoding(ExactBuffers):
