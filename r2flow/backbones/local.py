@@ -48,11 +48,13 @@ class Local(Backbone):
         if torch.is_autocast_enabled(x.device.type):
             x = x.to(torch.get_autocast_dtype(x.device.type))  # before the copies that follow
         x = x.contiguous(memory_format=torch.channels_last)  # up to twice as fast on a CPU
-        h = self.image(wrapped(x, margin, margin) if margin else x)
-        h = h + self.time(t)[:, :, None, None].to(h.dtype)
+        if margin:
+            x = wrapped(x, margin, margin)
+        x = self.image(x)  # frees its input
+        x = x + self.time(t)[:, :, None, None].to(x.dtype)
         for block in self.blocks:
-            h = block(h)
-        return self.answer(F.silu(h))[..., margin : margin + columns].contiguous()
+            x = block(x)
+        return self.answer(F.silu(x))[..., margin : margin + columns].contiguous()
 
     def open_ring(self) -> None:
         self.margin = 0
