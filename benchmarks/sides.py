@@ -58,15 +58,15 @@ def points() -> Work:
     return lambda: flow.complete(cloud, sensor="vlp16")
 
 
-def sampling() -> Work:
+def sampling(precision: str) -> Work:
     """A scan of `street` in 16 evaluations."""
     import r2flow
 
     flow = r2flow.load("street")
-    return lambda: flow.sample(1, sampler="adams3", steps=16)
+    return lambda: flow.sample(1, sampler="adams3", steps=16, precision=precision)
 
 
-def training(name: str) -> Work:
+def training(name: str, rounded: bool = False) -> Work:
     """A training step on one image of 2 x 64 x 1024: forward, backward and AdamW."""
     import torch
 
@@ -79,7 +79,9 @@ def training(name: str) -> Work:
 
     def step() -> None:
         optimiser.zero_grad()
-        model(0.5, x).square().mean().backward()
+        with torch.autocast("cpu", torch.bfloat16, enabled=rounded):
+            loss = model(0.5, x).square().mean()
+        loss.backward()
         optimiser.step()
 
     return step
@@ -104,9 +106,12 @@ CASES: dict[str, Callable[[], Work]] = {
     "vlp16": points,
     "hdl64e": lambda: completing("hdl64e", None, 4),
     "os1_128": lambda: completing("os1_128", (128, 1024), 4),
-    "street": sampling,
+    "street": lambda: sampling("32-true"),
+    "street_bf16": lambda: sampling("bf16-mixed"),
     "hdit_tiny": lambda: training("hdit_tiny"),
+    "hdit_tiny_bf16": lambda: training("hdit_tiny", rounded=True),
     "hdit": lambda: training("hdit"),
+    "hdit_bf16": lambda: training("hdit", rounded=True),
     "pictures": pictures,
 }
 

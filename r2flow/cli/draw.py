@@ -17,7 +17,6 @@ from r2flow.cli.options import (
     DrawOptions,
     ModelArgument,
     OutOption,
-    PrecisionOption,
     SamplerOptions,
     ScaleChoice,
     SeedOption,
@@ -72,7 +71,13 @@ def sample(
     checkpoint: Annotated[
         str | None, Option("--checkpoint", "-c", help="The model, as `complete` takes it.")
     ] = None,
-    precision: PrecisionOption = "32-true",
+    precision: Annotated[
+        Literal["32-true", "bf16-mixed"] | None,
+        Option(
+            help="Precision of the network. Default: bf16-mixed for street on a CPU with bfloat16, "
+            "else 32-true."
+        ),
+    ] = None,
     format: Annotated[
         str | None, Option(help="Formats, of ply,bin,npy. Default: all possible.")
     ] = None,
@@ -87,6 +92,7 @@ def sample(
     The default sampler is the generator's.
     """
     from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.model.completion import usual_precision
     from r2flow.model.shipped import DEFAULT, find_model
     from r2flow.reports.outputs import write_samples
 
@@ -111,7 +117,7 @@ def sample(
         pictures,
         draw.batch_size,
         region,
-        precision=precision,
+        precision=precision or usual_precision(loaded.generator, model in (None, DEFAULT)),
         labels=_labelling(labels, loaded) if labels else None,
     )
     there = len(list(out.glob(f"[0-9]*.{formats[0]}")))
