@@ -111,7 +111,7 @@ def _tiles(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tens
     for top in range(0, len(keys), band):
         part = slice(top, top + band)
         asked = tiles[:, part]
-        seen = mask[part].expand(len(q), -1, -1, -1, -1, -1).flatten(0, 2)
+        seen = mask[part].expand(q.shape[0], -1, -1, -1, -1, -1).flatten(0, 2)
         attended = _attend(
             asked.flatten(3, 4).flatten(0, 2), _halo(k, keys[part]), _halo(v, keys[part]), seen
         )
