@@ -1,7 +1,6 @@
 """Scans as pictures in the width of a paper's page: images, bird's-eye view, 3-D perspective."""
 
 import logging
-import math
 import warnings
 from collections.abc import Sequence
 from functools import cache
@@ -252,28 +251,19 @@ class _Dots(Artist):
 
     @allow_rasterization
     def draw(self, renderer: Any) -> None:
-        box = self.axes.bbox
-        left, bottom = math.floor(box.x0), math.floor(box.y0)
-        pixels = np.zeros((math.ceil(box.y1) - bottom, math.ceil(box.x1) - left, 4), np.uint8)
-        rows, columns = pixels.shape[:2]
-        x, y = (self.axes.transData.transform(self.points) - (left, bottom)).T
-        sides = renderer.points_to_pixels(1.0) * np.sqrt(self.sizes)
-        sides = np.rint(sides).clip(min=1).astype(int)
-        first = np.rint(np.stack([x, y]) - sides / 2).astype(int)
+        axes: Any = self.axes
+        x, y, right, top = np.rint(axes.bbox.extents).astype(int)
+        pixels = np.zeros((top - y, right - x, 4), np.uint8)
+        sides = np.rint(renderer.points_to_pixels(1) * np.sqrt(self.sizes)).clip(1)[:, None]
         most = int(sides.max(initial=0))
-        # Far points first, and all pixels of a point after those of the points before it.
-        down, right = np.mgrid[:most, :most].reshape(2, -1, 1)
-        inside = (down < sides) & (right < sides)
-        column = first[0] + right
-        row = first[1] + down
-        inside &= (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-        inside = inside.T
-        point = np.broadcast_to(np.arange(len(x))[:, None], inside.shape)[inside]
-        pixels[row.T[inside], column.T[inside]] = self.colours[point]
-        context = renderer.new_gc()
-        context.set_clip_rectangle(box)
-        renderer.draw_image(context, left, bottom, pixels)
-        context.restore()
+        steps = np.mgrid[:most, :most].reshape(2, 1, -1)
+        corners = axes.transData.transform(self.points).T[..., None] - sides / 2
+        places = np.rint(corners).astype(int) - [[[x]], [[y]]] + steps  # (2, points, steps)
+        limits = [[[right - x]], [[top - y]]]
+        seen = ((steps < sides) & (places >= 0) & (places < limits)).all(0)
+        column, row = places[:, seen]
+        pixels[row, column] = self.colours[seen.nonzero()[0]]
+        renderer.draw_image(renderer.new_gc(), x, y, pixels)
 
 
 def _draw_points(
@@ -342,7 +332,7 @@ def _frame(axes: Any, title: str, label: bool, background: str = "white") -> Non
         axes.set_title(title, fontsize=7, loc="left", pad=2)
 
 
-def _add_bar(axes: Any, scale: ScalarMappable, ticks: dict[float, float]) -> None:
+def _add_bar(axes: Any, scale: Any, ticks: dict[float, float]) -> None:
     """Draw a colour bar to the right, without axes of its own, which take as long as the rest."""
     place = TransformedBbox(Bbox.from_bounds(1.012, 0, 0.014, 1), axes.transAxes)
     bar = BboxImage(place, cmap=scale.cmap, norm=scale.norm, clip_on=False)
