@@ -98,67 +98,42 @@ class _Axis:
 
 
 def _tiles(q: Tensor, k: Tensor, v: Tensor, rows: _Axis, columns: _Axis) -> Tensor:
-    plan = _tile_plan.__wrapped__ if torch.compiler.is_compiling() else _tile_plan
-    tile_h, tile_w, keys, mask = plan(rows, columns, q.dtype, q.device)
+    tile_h = min(_TILE[0], rows.size)
+    tile_w = min(_TILE[1], columns.size)
     below = -rows.size % tile_h
     right = -columns.size % tile_w
     if below or right:
         q = F.pad(q, (0, 0, 0, 0, 0, right, 0, below))
-    # (B, tiles_h, tiles_w, tile_h, tile_w, N, D)
-    tiles = q.unflatten(2, (-1, tile_w)).unflatten(1, (-1, tile_h)).transpose(2, 3)
+    keys_h = rows.keys(tile_h, q.device)
+    keys_w = columns.keys(tile_w, q.device)
+    mask = _tile_mask(rows.sees(tile_h, keys_h), columns.sees(tile_w, keys_w), q.dtype)
+    keys_w = keys_w % columns.size
+    tiles = q.unflatten(2, (-1, tile_w)).unflatten(1, (-1, tile_h)).permute(0, 1, 3, 5, 2, 4, 6)
     band = -(-rows_at_once(q) // tile_h)
     out = []
-    for top in range(0, len(keys), band):
+    for top in range(0, len(mask), band):
         part = slice(top, top + band)
-        asked = tiles[:, part]
-        seen = mask[part].expand(q.shape[0], -1, -1, -1, -1, -1).flatten(0, 2)
-        attended = _attend(
-            asked.flatten(3, 4).flatten(0, 2), _halo(k, keys[part]), _halo(v, keys[part]), seen
-        )
-        attended = attended.view(*asked.shape[:-1], -1)
-        out.append(attended.transpose(2, 3).flatten(3, 4).flatten(1, 2))
+        # (B, tiles_h, tiles_w, N, queries, keys)
+        logits = tiles[:, part].flatten(4, 5) @ _halo(k, keys_h[part], keys_w).mT
+        weights = torch.softmax(logits.add_(mask[part]), dim=-1)
+        attended = (weights @ _halo(v, keys_h[part], keys_w)).unflatten(4, (tile_h, tile_w))
+        out.append(attended.permute(0, 1, 4, 2, 5, 3, 6).flatten(3, 4).flatten(1, 2))
     return torch.cat(out, dim=1)[:, : rows.size, : columns.size]
 
 
-def _attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
-    """Attention for q (T, queries, N, D), k and v (T, keys, N, D) and a mask that is added."""
-    q, k, v = (x.transpose(1, 2) for x in (q, k, v))
-    if q.is_cpu and q.dtype == torch.bfloat16 and torch.is_grad_enabled():
-        # Twice as fast as the backward pass of the fused function.
-        out = torch.softmax((q @ k.mT).add_(mask), dim=-1) @ v
-    else:
-        out = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, scale=1.0)
-    return out.transpose(1, 2)
+def _halo(x: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """Keys of tiles by rows (tiles_h, keys_h), columns (tiles_w, keys_w): (B, ., ., N, keys, D)."""
+    x = x.index_select(1, rows.flatten()).unflatten(1, rows.shape)
+    x = x.index_select(3, columns.flatten()).unflatten(3, columns.shape)
+    return x.permute(0, 1, 3, 5, 2, 4, 6).flatten(4, 5)
 
 
-def _halo(x: Tensor, keys: Tensor) -> Tensor:
-    """Keys of tiles by their positions (tiles_h, tiles_w, keys): (B tiles, keys, N, D)."""
-    found = x.flatten(1, 2).index_select(1, keys.flatten())
-    return found.unflatten(1, (-1, keys.shape[2])).flatten(0, 1)
-
-
-@functools.lru_cache(maxsize=64)
-def _tile_plan(
-    rows: _Axis, columns: _Axis, dtype: torch.dtype, device: torch.device
-) -> tuple[int, int, Tensor, Tensor]:
-    """Rows and columns of a tile, positions of the tiles' keys (tiles_h, tiles_w, keys) in the
-    flattened map, and 0 for keys in the query's window, else -inf, (tiles_h, tiles_w, 1, queries,
-    keys).
-    """
-    tile_h = min(_TILE[0], rows.size)
-    tile_w = min(_TILE[1], columns.size)
-    with torch.inference_mode(False):
-        keys_h = rows.keys(tile_h, device)
-        keys_w = columns.keys(tile_w, device)
-        seen_h = rows.sees(tile_h, keys_h)
-        seen_w = columns.sees(tile_w, keys_w)
-        seen = seen_h[:, None, :, None, :, None] & seen_w[:, None, :, None]
-        seen = seen.flatten(4, 5).flatten(2, 3).unsqueeze(2)
-        mask = torch.zeros(seen.shape, dtype=dtype, device=device)
-        mask = mask.masked_fill_(~seen, -torch.inf).repeat(1, len(keys_w) // seen.shape[1], 1, 1, 1)
-        keys_w = keys_w % columns.size
-        keys = keys_h[:, None, :, None] * columns.size + keys_w[:, None]
-    return tile_h, tile_w, keys.flatten(2), mask
+def _tile_mask(seen_h: Tensor, seen_w: Tensor, dtype: torch.dtype) -> Tensor:
+    """0 for keys in the query's window, else -inf, (tiles_h, tiles_w or 1, 1, queries, keys)."""
+    seen = seen_h[:, None, :, None, :, None] & seen_w[:, None, :, None]
+    seen = seen.flatten(4, 5).flatten(2, 3).unsqueeze(2)
+    zeros = torch.zeros(seen.shape, dtype=dtype, device=seen.device)
+    return zeros.masked_fill_(~seen, -torch.inf)
 
 
 @functools.cache
