@@ -166,7 +166,7 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
     if usable:
         lost = usable.count(False)
         print(
-            f"{len(usable)} pairs of noise and scan drawn, {len(usable) / seconds:.1f} pairs/s, "
+            f"{len(usable)} pairs drawn, {len(usable) / seconds:.1f} pairs/s, "
             f"{evaluations / len(usable):.3g} evaluations a pair"
             + (f"; left out: {lost} did not converge" if lost else ""),
             flush=True,

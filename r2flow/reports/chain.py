@@ -29,29 +29,22 @@ from r2flow.samplers import FixedSteps
 
 _SCANS = 32  # of each set that is compared
 _STAGES = {"rectify": "trained on scans", "reflow": "straightened", "distill": "distilled"}
-_INCLUDED = f"{DEFAULT} (included)"
-_GOAL = "training scans (the goal)"
+_GOAL = "training scans"
 _COLUMNS = {
     "scans": "scans",
-    "solver": "solver",
     "calls": "evaluations",
     "milliseconds": "ms a scan",
     "distance": "distance",
 }
-_NOTES = """
-evaluations: runs of the network for a scan
-euler: straight steps; adams3: steps that bend with the last three velocities
-refine: jumps with fresh noise between them
-"""
 # What the ratio of two distances is called; 5 % count as equal.
 _RATIOS = (0.5, 0.95, 1.05, 2.0)
 _WORDS = ("far better than", "better than", "about as good as", "worse than", "far worse than")
 _NEXT = """
 next, with your own scans in FOLDER (.pcd, .ply, .bin, ...); step by step: docs/tutorial.md
   r2flow complete FOLDER --out dense                                     # add beams to them
-  r2flow train experiment=finetune stage.parent=street data.root=FOLDER  # draw scans like them
+  r2flow train experiment=finetune stage.parent=street data.root=FOLDER  # train on them
 without scans
-  r2flow sample street --num 16 --out scans                              # good street scenes"""
+  r2flow sample street --num 16 --out scans                              # draw street scenes"""
 
 
 def link_label(name: str, config: Options) -> str:
@@ -73,34 +66,39 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
     drawn = list(_drawn(makers, device))
     rows = [row for row, _ in drawn]
     about = f"{_SCANS} scans of each"
-    said = [_NOTES]
+    captions = [row["title"] for row in rows]
+    labels = [link_label(one, model.config) for one, model in makers.items()]
+    if rows[-1]["scans"] == DEFAULT:
+        labels.append(f"{DEFAULT} (included in r2flow)")
+    said = ["\n" + ", ".join(labels), "evaluations: runs of the network for a scan\n"]
     then = what_next(runs[name], out, last.config | {"data": first.config.get("data", {})})
     if sets := _scan_sets(first):
         unseen, training = sets
-        drawn.insert(0, ({"scans": _GOAL, "title": _GOAL}, training[:].numpy()))
+        drawn.insert(0, ({"scans": _GOAL}, training[:].numpy()))
         rows = _with_distances(drawn, unseen, training)
+        ends = [f"{row['title']}: distance {row['distance']}" for row in rows[1:-1]]
+        captions = ["a training scan", *ends]
         said += _conclusion(rows, first.step * first.config["data"]["batch_size"])
         nearest = min(rows[1:], key=lambda row: row["distance"])
-        if nearest["scans"] == _INCLUDED:
+        if nearest["scans"] == DEFAULT:
             then = _NEXT
         about = (
-            f"Distance of {_SCANS} scans of each to {len(unseen)} unseen scans; smaller is better, "
-            "0: equal statistics"
+            f"Distance of {_SCANS} scans of each to {len(unseen)} unseen scans. Smaller is better; "
+            f"a perfect flow would have that of the {_GOAL}."
         )
     page = compare_page({run.label: [run] for run in read_runs(list(runs.values()))})
     page = replace(page, text=[about, table(rows, _COLUMNS), "\n".join(said), *page.text])
-    page.figures["steps"] = contact_sheet(
-        [scans[0] for _, scans in drawn], last.sensor.rays(), [row["title"] for row, _ in drawn]
-    )
+    images = [scans[0] for _, scans in drawn]
+    page.figures["steps"] = contact_sheet(images, last.sensor.rays(), captions)
     write_samples(last, out, num=4, seed=0, pictures=4, replace=True)
     *_, page_path = write_page(page, out)
     print_table(rows, _COLUMNS, f"\n{about}")
     print(*said, sep="\n")
     print(
         f"""
-pictures      {out / "steps.png"}, the first scan of each row
-in 3-D        {out / "samples.html"}, four scans of {name} in a browser
-point clouds  {out / "000000.ply"} ...
+look first    {out / "steps.png"}: a scan of each row; black: no return
+in 3-D        {out / "samples.html"}: four scans of {name}, in a browser
+point clouds  {out / "000000.ply"} ... of {name}
 details       {page_path}
 {then}""",
         flush=True,
@@ -113,10 +111,10 @@ def _drawn(makers: Mapping[str, Checkpoint], device: str) -> Iterator[tuple[Row,
     """
     for name, model in makers.items():
         for sampler in _samplers(model.generator):
-            yield _draw(model, link_label(name, model.config), sampler)
+            yield _draw(model, name, sampler)
     included = load_checkpoint(find_model(DEFAULT), device)
     if included.sensor.same_image(model.sensor):
-        yield _draw(included, _INCLUDED, included.generator.choose(steps=2))
+        yield _draw(included, DEFAULT, included.generator.choose(steps=2))
 
 
 def _samplers(generator: Generator) -> list[Sampler]:
@@ -168,16 +166,19 @@ def _with_distances(
     best, name = min((distance(scans[:].numpy()), name) for name, scans in baselines)
     return [
         *({**row, "distance": distance(images)} for row, images in drawn),
-        {"scans": f"{name} (best without a network)", "distance": best},
+        {"scans": f"{name}, no network", "distance": best},
     ]
 
 
 def _conclusion(rows: Sequence[Row], images: int) -> list[str]:
-    """What the distances say: of each flow next to the one before at equal cost; of the best flow
-    next to the best baseline and to the included model. `images`: seen by the first flow.
+    """What the distances say: of the flows next to the best baseline, of each next to the one
+    before at equal cost, and of the included model. `images`: seen by the first flow.
     """
-    flows = [row for row in rows if "calls" in row and row["scans"] != _INCLUDED]
-    said = []
+    flows = [row for row in rows if "calls" in row and row["scans"] != DEFAULT]
+    *_, baseline = rows
+    limit = _RATIOS[1] * baseline["distance"]
+    near = [row["title"] for row in flows if row["distance"] < limit] or ["no flow"]
+    said = [f"Clearly better than {baseline['scans']}: {', '.join(near)}."]
     latest: dict[Any, Row] = {}  # by cost
     for row in flows:
         cost = row["solver"], row["calls"]
@@ -185,11 +186,10 @@ def _conclusion(rows: Sequence[Row], images: int) -> list[str]:
             said.append(_compare(row, latest[cost]))
         latest[cost] = row
     best = min(flows, key=lambda row: row["distance"])
-    said.append(f"Best flow: {_compare(best, rows[-1])}")
     for row in rows:
-        if row["scans"] == _INCLUDED:
-            why = f"{DEFAULT} has learned from over a million images, these flows from {images:,}."
-            said += [_compare(row, best), why]
+        if row["scans"] == DEFAULT:
+            seen = f"{DEFAULT} has seen over a million images, {flows[0]['scans']} {images:,}."
+            said.append(f"{_compare(row, best)} {seen}")
     return [f"- {sentence}" for sentence in said]
 
 

@@ -92,11 +92,11 @@ def finish(
         print(f"stopped at step {checkpoint.step}: the same command resumes from here")
     for name, (steps, values) in curves.items():
         tenth = max(len(values) // 10, 1)
-        start = f"{values[:tenth].mean():#.3g} at first, " if len(values) > 1 else ""
-        single = ""
-        if tenth == 1 and name.startswith("train/"):
-            single = " (noisy: of one batch each)"
-        print(f"{CURVES[name]}: {start}{values[-tenth:].mean():#.3g} at step {steps[-1]}{single}")
+        start = f"{values[:tenth].mean():#.3g} at step {steps[0]}, " if len(values) > 1 else ""
+        over = ""
+        if name.startswith("train/"):
+            over = f" (means of {tenth} logged batches)" if tenth > 1 else " (noisy: of one batch)"
+        print(f"{CURVES[name]}: {start}{values[-tenth:].mean():#.3g} at step {steps[-1]}{over}")
     print(f"\ncheckpoint    {checkpoint.path}")
     num = samples["num"]
     if num == 0 or not checkpoint.generator.unconditional:

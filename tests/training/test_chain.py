@@ -15,8 +15,9 @@ from r2flow.data.datamodule import ScanDataModule
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.paths import checkpoints_of
 from r2flow.model.saving import weights_hash
+from r2flow.model.shipped import DEFAULT
 from r2flow.model.tensor_files import read_checkpoint
-from r2flow.reports.chain import _INCLUDED, _conclusion, _scan_sets, _with_distances, report_chain
+from r2flow.reports.chain import _conclusion, _scan_sets, _with_distances, report_chain
 from r2flow.runs.chain import links_of
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import has_ended
@@ -109,9 +110,9 @@ def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
         "evaluations a pair",
         "pairs/s",
         "[2/3] rf2 (straightened): ",
-        "rf1 (trained on scans)  ",
-        " (best without a network)",
-        "- Best flow: ",
+        "rf1 (trained on scans), rf2 (straightened), td2 (distilled)",
+        ", no network",
+        "- Clearly better than ",
         "r2flow sample",
     ):
         assert words in said
@@ -156,16 +157,17 @@ def test_the_conclusion_follows_the_distances():
         return {"scans": scans, "title": f"{scans} in {calls:g}", "distance": distance, **cost}
 
     rows = [row("a", 0.3), row("a", 0.2, 2.0), row("b", 0.1), row("b", 0.205, 2.0)]
-    baseline = {"scans": "noise", "distance": 0.09}
+    baseline = {"scans": "noise", "distance": 0.21}
     told = [
+        "- Clearly better than noise: b in 1.",
         "- b in 1 is far better than a: 0.100 against 0.300.",
         "- b in 2 is about as good as a: 0.205 against 0.200.",
-        "- Best flow: b in 1 is worse than noise: 0.100 against 0.090.",
     ]
     assert _conclusion([*rows, baseline], 2400) == told
-    included = _conclusion([*rows, row(_INCLUDED, 0.3), baseline], 2400)
-    assert f"- {_INCLUDED} in 1 is far worse than b: 0.300 against 0.100." == included[3]
-    assert "2,400" in included[4]
+    included = _conclusion([*rows, row(DEFAULT, 0.3), baseline | {"distance": 0.1}], 2400)
+    assert included[0] == "- Clearly better than noise: no flow."
+    assert f"- {DEFAULT} in 1 is far worse than b: 0.300 against 0.100." in included[3]
+    assert included[3].endswith("a 2,400.")
 
 
 def test_a_finished_chain_is_not_run_again(chained: tuple[Path, str], scans: Path, tmp_path: Path):

@@ -93,7 +93,7 @@ def test_a_finished_run_is_not_trained_again(train: Run, copied: Path):
     done = train("name=copied")
     assert "training 12/12" not in done.stderr  # the line of training's progress
     assert "checkpoint" in done.stdout
-    assert "(noisy: of one batch each)" in done.stdout
+    assert "(noisy: of one batch)" in done.stdout
     torch.testing.assert_close(weights(copied), before, rtol=0, atol=0)
 
 
