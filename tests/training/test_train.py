@@ -56,7 +56,7 @@ def test_a_run_leaves_everything_in_its_folder_and_says_where(alone: tuple[Path,
         "loss.png",
         "000000.ply",
         "r2flow sample",
-        "val/loss",
+        "validation loss",
     ):
         assert words in said
     assert [p.name for p in checkpoints_of(run)] == ["step-00000012.ckpt", "step-00000010.ckpt"]
