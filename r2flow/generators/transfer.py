@@ -81,6 +81,8 @@ class TransferFlow(Flow):
     Args:
         backbone: Name and options of a backbone for any size, as in conf/backbone/local.yaml.
         sigma: Standard deviation of the noise in x_0, in model space.
+        twice: Evaluate scans of other sensors twice, see `answers`; not for a network that has
+            learned the ray-drop of the second evaluation.
     """
 
     takes_condition = True
@@ -89,10 +91,15 @@ class TransferFlow(Flow):
     default_sampler = Jump(steps=1)
 
     def __init__(
-        self, space: ModelSpace, backbone: Mapping[str, Any], sigma: NonNegative = 0.25
+        self,
+        space: ModelSpace,
+        backbone: Mapping[str, Any],
+        sigma: NonNegative = 0.25,
+        twice: bool = True,
     ) -> None:
         super().__init__(space)
         self.sigma = sigma
+        self.twice = twice
         inputs = space.shape[0] + FEATURES + RowFeatures.FEATURES + space.encoding.labels
         self.classes = len(COMMON) if space.encoding.labels else 0
         outputs = 3 * _CANDIDATES + 2 + self.classes
@@ -159,7 +166,7 @@ class TransferFlow(Flow):
         """
         inputs = self._inputs(x, about, rows)
         output = self.backbone(t, inputs).float()
-        if self.foreign and holds((about.sure == 0).any()):
+        if self.foreign and self.twice and holds((about.sure == 0).any()):
             elevation = x.shape[1] - self.classes + FEATURES + ROW
             inputs[:, elevation] += STEEP * _RAISED
             output[:, _RETURN] = self.backbone(t, inputs).float()[:, _RETURN]
@@ -334,7 +341,8 @@ class TransferFlow(Flow):
         x = torch.where(within_reach(known.amax(1, True)), x, self._empty(image[:, :1]))
         x = torch.where(known > 0, image, x)
         # See `answers` and `_share`.
-        evaluations = generated.evaluations * (2 if self.foreign and hidden else 1) + tested
+        twice = self.foreign and self.twice and hidden
+        evaluations = generated.evaluations * (2 if twice else 1) + tested
         return replace(generated, x=x, evaluations=evaluations)
 
     def loss(

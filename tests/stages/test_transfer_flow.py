@@ -128,7 +128,10 @@ def test_the_intensities_of_another_sensor_may_have_any_scale(flow, scans):
     )
     assert one[:, 1].max() > 0.1
     counted = other.backbone.register_forward_hook(lambda *_: runs.append(1))
-    assert answered(other, bright, state).evaluations.tolist() == [len(runs)] * len(scans)
+    for other.twice in (True, False):
+        runs.clear()
+        assert answered(other, bright, state).evaluations.tolist() == [len(runs)] * len(scans)
+        assert len(runs) == 2 + other.twice
     counted.remove()
 
 
