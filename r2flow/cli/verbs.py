@@ -89,10 +89,10 @@ def run(arguments: Sequence[str], command: Sequence[str]) -> int:
 
 def _verb_of_model(text: str) -> str:
     """Advice for a model's name in the place of a verb."""
-    from r2flow.model.shipped import DENSIFY, MODELS
+    from r2flow.model.shipped import DEFAULT, MODELS
 
     for name in MODELS:
         if f"command '{name}'" in text:
-            verb = f"complete SCANS -c {name}" if name == DENSIFY else f"sample -c {name}"
+            verb = f"sample -c {name}" if name == DEFAULT else f"complete SCANS -c {name}"
             return f": it is a model. Did you mean 'r2flow {verb} --out FOLDER'?"
     return ""
