@@ -1,10 +1,11 @@
-"""Completion of real scans of eight sensors: `densify` beside the interpolations.
+"""Completion of real scans of eight sensors: `densify`, `densify_small` and the interpolations.
 
 The scans lie outside the repository, in the folder `real` of R2FLOW_SHARED. Each scan is of another
 place. A sensor's rows are its own beams (`r2flow sensor`), those of the HDL-64E the image of the
-paper. Cells: `densify`, then the best interpolation of that cell; with four places or more the
-difference and its paired 95 % interval (Student's t) too. A cell ends with + where `densify` is
-ahead, with - where it is behind; doubled where zero lies outside of the interval.
+paper. Cells: a model, then the best interpolation of that cell; with four places or more the
+difference and its paired 95 % interval (Student's t) too. A cell ends with + where the model is
+ahead, with - where it is behind; doubled where zero lies outside of the interval; IoU is compared
+by its inverse. Last: each further model's errors over the first one's.
 
 python benchmarks/real.py                                       # half an hour of one core
 python benchmarks/real.py --sensors VLP-16,OS1-128 --out real.json
@@ -77,11 +78,13 @@ def scans_of(name: str) -> tuple[list[Path], Reading]:
     return paths, reading
 
 
-def rows_of(name: str, tasks: Sequence[str]) -> list[Row]:
+def rows_of(name: str, tasks: Sequence[str], models: Sequence[str]) -> list[Row]:
     """A row a place, task and method."""
     paths, reading = scans_of(name)
-    model = load_checkpoint("densify").through(reading.sensor)
-    ways = {"densify": (model, completing(model.generator, several=False))}
+    ways = {}
+    for one in models:
+        model = load_checkpoint(one).through(reading.sensor)
+        ways[one] = (model, completing(model.generator, several=False))
     rows = []
     for path in paths:
         truth = read_image(path, reading)
@@ -91,16 +94,19 @@ def rows_of(name: str, tasks: Sequence[str]) -> list[Row]:
     return rows
 
 
-def cell(rows: Sequence[Row], key: str, less: bool) -> str:
-    """`densify`, the best interpolation, and the interval of the difference over places."""
-    values = {}
-    for method in ("densify", *INTERPOLATIONS):
-        values[method] = np.array([row.get(key, np.nan) for row in rows if row["method"] == method])
-    own = values.pop("densify")
+def values_of(rows: Sequence[Row], method: str, key: str) -> np.ndarray:
+    """An error of a method at each place; NaN where there is nothing to compare."""
+    return np.array([row.get(key, np.nan) for row in rows if row["method"] == method])
+
+
+def cell(rows: Sequence[Row], model: str, key: str, less: bool) -> str:
+    """The model, the best interpolation, and the interval of the difference over places."""
+    own = values_of(rows, model, key)
     if np.isnan(own).all():
         return ""
     sign = 1 if less else -1
-    best = min(values.values(), key=lambda each: sign * each.mean())
+    others = [values_of(rows, method, key) for method in INTERPOLATIONS]
+    best = min(others, key=lambda each: sign * each.mean())
     gain = sign * (best - own)
     mark = "+" if gain.mean() > 0 else "-"
     text = f"{own.mean():.3f} {best.mean():.3f}"
@@ -111,29 +117,51 @@ def cell(rows: Sequence[Row], key: str, less: bool) -> str:
     return f"{text} {mark}"
 
 
+def ratio(rows: Sequence[Row], models: Sequence[str], key: str, less: bool) -> float:
+    """Mean error of the second model over that of the first."""
+    first, second = (values_of(rows, model, key).mean() for model in models)
+    return float(second / first if less else first / second)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--sensors", default=",".join(FILES))
     parser.add_argument("--tasks", default=" ".join(TASKS))
+    parser.add_argument("--models", default="densify,densify_small")
     parser.add_argument("--out", type=Path, help="JSON of all rows; read instead, if it is there")
     args = parser.parse_args()
+    models = args.models.split(",")
     if args.out and args.out.exists():
         rows = json.loads(args.out.read_text())
     else:
         names = args.sensors.split(",")
-        rows = [row for name in names for row in rows_of(name, args.tasks.split())]
+        rows = [row for name in names for row in rows_of(name, args.tasks.split(), models)]
         if args.out:
             args.out.write_text(json.dumps(rows))
     lines = []
+    ratios = []
     for name in dict.fromkeys(row["sensor"] for row in rows):
         for task in dict.fromkeys(row["task"] for row in rows):
             part = [row for row in rows if (row["sensor"], row["task"]) == (name, task)]
             places = len({row["place"] for row in part})
-            cells = [cell(part, key, less) for key, (_, less) in METRICS.items()]
-            lines.append([f"{name}, {places}", task, *cells])
-    print_table(lines, ["sensor, places", "known", *(heading for heading, _ in METRICS.values())])
+            for model in models:
+                cells = [cell(part, model, key, less) for key, (_, less) in METRICS.items()]
+                lines.append([f"{name}, {places}", task, model, *cells])
+            for model in models[1:]:
+                pair = (models[0], model)
+                cells = [ratio(part, pair, key, less) for key, (_, less) in METRICS.items()]
+                ratios.append([model, name, task, *cells])
+    metrics = [heading for heading, _ in METRICS.values()]
+    print_table(lines, ["sensor, places", "known", "model", *metrics])
+    print_table(
+        [[*line[:3], *(f"{value:.3f}" for value in line[3:])] for line in ratios],
+        ["model", "sensor", "known", *metrics],
+    )
+    for model in models[1:]:
+        found = np.array([line[3:] for line in ratios if line[0] == model])
+        print(f"{model}: {np.nanmedian(found):.3f} in the median cell")
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ repetitions, the table the medians over the runs. Scans are simulated.
 git worktree add ../before main
 python benchmarks/sides.py ../before . --runs 5
 python benchmarks/sides.py ../before . --cases vlp16,street
+python benchmarks/sides.py . . --models densify,densify_small --cases vlp16,hdl64e,os1_128
 """
 
 import argparse
@@ -21,10 +22,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 Work = Callable[[], object]
+MODEL = "SIDES_MODEL"  # environment variable: the model that completes
 
 
 def completing(sensor: str, size: tuple[int, int] | None, keep: int) -> Work:
-    """Completion by `densify` of every `keep`-th row of an image of a sensor."""
+    """Completion of every `keep`-th row of an image of a sensor."""
     import torch
 
     import r2flow
@@ -32,7 +34,7 @@ def completing(sensor: str, size: tuple[int, int] | None, keep: int) -> Work:
     from r2flow.lidar.sensors import SENSORS
     from r2flow.simulator import simulate
 
-    flow = r2flow.load("densify")
+    flow = r2flow.load(os.environ[MODEL])
     if size:
         flow = flow.through(SENSORS[sensor].resized(*size))
     images = torch.from_numpy(simulate(flow.sensor, 1, 0).image)[None]
@@ -54,7 +56,7 @@ def points() -> Work:
     sensor = SENSORS["vlp16"].resized(16, 1800)
     xyz, strength = image_to_points(simulate(sensor, 1, 0).image, sensor)
     cloud = np.column_stack([xyz, strength])
-    flow = r2flow.load("densify")
+    flow = r2flow.load(os.environ[MODEL])
     return lambda: flow.complete(cloud, sensor="vlp16")
 
 
@@ -139,6 +141,7 @@ def main() -> None:
     )
     parser.add_argument("checkouts", nargs="*", type=Path)
     parser.add_argument("--cases", default=",".join(CASES))
+    parser.add_argument("--models", default="densify,densify", help="of the two, to complete")
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--run", help=argparse.SUPPRESS)  # of a process for one case
@@ -152,7 +155,8 @@ def main() -> None:
     for case in given.cases.split(","):
         found: list[list[dict[str, float]]] = [[] for _ in given.checkouts]
         for _ in range(given.runs):
-            for checkout, results in zip(given.checkouts, found, strict=True):
+            models = given.models.split(",")
+            for checkout, model, results in zip(given.checkouts, models, found, strict=True):
                 command = [sys.executable, "-W", "ignore", __file__, "--run", case]
                 done = subprocess.run(
                     [*command, "--repeats", str(given.repeats)],
@@ -160,6 +164,7 @@ def main() -> None:
                         **os.environ,
                         "PYTHONPATH": str(checkout.resolve()),
                         "OMP_NUM_THREADS": "1",
+                        MODEL: model,
                     },
                     stdout=subprocess.PIPE,
                     check=True,
