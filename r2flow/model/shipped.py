@@ -35,6 +35,10 @@ MODELS: Registry[Model] = Registry(
         "labels of scans, scans of labels and denser scans with both, from simulated scans",
         "3c173b5af27dc25516fdc24240cb4ea92533371668b6ba3013ea1404c13f126d",
     ),
+    densify_small=Model(
+        "as densify with nearly its errors, in half of its time, learned from it",
+        "4a5832556d65a6085aec763045b8fed73bae36f7919ac7440af56e4027f24c05",
+    ),
 )
 DEFAULT = "street"
 DENSIFY = "densify"
