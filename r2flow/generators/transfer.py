@@ -56,7 +56,7 @@ _OTHER = 0.02  # share of a class that the nearest returns have not, before the 
 # Other sensors: what a return in the wrong place costs, as a share of one where there is none.
 _MISPLACED = 0.5
 # Other sensors: low rays are not lost as those that the training sensor's own car hides.
-_RAISED = math.radians(3)
+RAISED = math.radians(3)
 WEIGHTS = {"range": 1.0, "return": 2.0, "reflectance": 4.0, "label": 1.0}  # loss weights
 
 
@@ -168,7 +168,7 @@ class TransferFlow(Flow):
         output = self.backbone(t, inputs).float()
         if self.foreign and self.twice and holds((about.sure == 0).any()):
             elevation = x.shape[1] - self.classes + FEATURES + ROW
-            inputs[:, elevation] += STEEP * _RAISED
+            inputs[:, elevation] += STEEP * RAISED
             output[:, _RETURN] = self.backbone(t, inputs).float()[:, _RETURN]
         return self._read(output, about, gain, share)
 
