@@ -289,7 +289,7 @@ class ScanDataModule(L.LightningDataModule):
     def summary(self) -> str:
         """What is trained on, as '117 folder scans and 1800 simulated scans, 213 held out'."""
         if self.pairs is not None:
-            return f"{self.pairs.num} pairs of noise and the scan that the parent draws from it"
+            return f"{self.pairs.num} pairs: noise, and the scan that stage.parent draws from it"
         assert isinstance(self.training_source, Mixture)
         counts = [
             f"{len(part)} {named.options.name} scans"

@@ -42,9 +42,9 @@ _WORDS = ("far better than", "better than", "about as good as", "worse than", "f
 _NEXT = """
 next, with your own scans in FOLDER (.pcd, .ply, .bin, ...); step by step: docs/tutorial.md
   r2flow complete FOLDER --out dense                                     # add beams to them
-  r2flow train experiment=finetune stage.parent=street data.root=FOLDER  # train on them
+  r2flow train experiment=finetune stage.parent=street data.root=FOLDER  # fine-tune on hundreds
 without scans
-  r2flow sample street --num 16 --out scans                              # draw street scenes"""
+  r2flow sample street --num 16 --out scans                              # generate street scenes"""
 
 
 def link_label(name: str, config: Options) -> str:
@@ -65,12 +65,12 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
     name, last = list(makers.items())[-1]
     drawn = list(_drawn(makers, device))
     rows = [row for row, _ in drawn]
-    about = f"{_SCANS} scans of each"
     captions = [row["title"] for row in rows]
     labels = [link_label(one, model.config) for one, model in makers.items()]
     if rows[-1]["scans"] == DEFAULT:
-        labels.append(f"{DEFAULT} (included in r2flow)")
-    said = ["\n" + ", ".join(labels), "evaluations: runs of the network for a scan\n"]
+        labels.append(f"{DEFAULT} (included in r2flow, larger)")
+    about = f"{', '.join(labels)}. An evaluation runs the network once."
+    said = []
     then = what_next(runs[name], out, last.config | {"data": first.config.get("data", {})})
     if sets := _scan_sets(first):
         unseen, training = sets
@@ -78,13 +78,14 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
         rows = _with_distances(drawn, unseen, training)
         ends = [f"{row['title']}: distance {row['distance']}" for row in rows[1:-1]]
         captions = ["a training scan", *ends]
-        said += _conclusion(rows, first.step * first.config["data"]["batch_size"])
+        said = _conclusion(rows, first.step * first.config["data"]["batch_size"])
         nearest = min(rows[1:], key=lambda row: row["distance"])
         if nearest["scans"] == DEFAULT:
-            then = _NEXT
-        about = (
-            f"Distance of {_SCANS} scans of each to {len(unseen)} unseen scans. Smaller is better; "
-            f"a perfect flow would have that of the {_GOAL}."
+            longer = f"chain.{next(iter(runs))}.trainer.max_steps={10 * first.step}"
+            then = f"{_NEXT}\nlonger training: the same command with name=longer {longer}"
+        about += (
+            f"\nDistance of {_SCANS} scans of each to {len(unseen)} unseen scans: smaller is "
+            f"better, and that of the {_GOAL} is the best to expect."
         )
     page = compare_page({run.label: [run] for run in read_runs(list(runs.values()))})
     page = replace(page, text=[about, table(rows, _COLUMNS), "\n".join(said), *page.text])
@@ -93,10 +94,10 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
     write_samples(last, out, num=4, seed=0, pictures=4, replace=True)
     *_, page_path = write_page(page, out)
     print_table(rows, _COLUMNS, f"\n{about}")
-    print(*said, sep="\n")
+    print("", *said, sep="\n")
     print(
         f"""
-look first    {out / "steps.png"}: a scan of each row; black: no return
+look first    {out / "steps.png"}: a scan of each flow; black: no return
 in 3-D        {out / "samples.html"}: four scans of {name}, in a browser
 point clouds  {out / "000000.ply"} ... of {name}
 details       {page_path}
@@ -166,7 +167,7 @@ def _with_distances(
     best, name = min((distance(scans[:].numpy()), name) for name, scans in baselines)
     return [
         *({**row, "distance": distance(images)} for row, images in drawn),
-        {"scans": f"{name}, no network", "distance": best},
+        {"scans": f"{name} (no network)", "distance": best},
     ]
 
 
@@ -189,7 +190,7 @@ def _conclusion(rows: Sequence[Row], images: int) -> list[str]:
     for row in rows:
         if row["scans"] == DEFAULT:
             seen = f"{DEFAULT} has seen over a million images, {flows[0]['scans']} {images:,}."
-            said.append(f"{_compare(row, best)} {seen}")
+            said.append(f"{_compare(row, best | {'scans': best['title']})} {seen}")
     return [f"- {sentence}" for sentence in said]
 
 

@@ -111,7 +111,7 @@ def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
         "pairs/s",
         "[2/3] rf2 (straightened): ",
         "rf1 (trained on scans), rf2 (straightened), td2 (distilled)",
-        ", no network",
+        " (no network)",
         "- Clearly better than ",
         "r2flow sample",
     ):
@@ -166,7 +166,7 @@ def test_the_conclusion_follows_the_distances():
     assert _conclusion([*rows, baseline], 2400) == told
     included = _conclusion([*rows, row(DEFAULT, 0.3), baseline | {"distance": 0.1}], 2400)
     assert included[0] == "- Clearly better than noise: no flow."
-    assert f"- {DEFAULT} in 1 is far worse than b: 0.300 against 0.100." in included[3]
+    assert f"- {DEFAULT} in 1 is far worse than b in 1: 0.300 against 0.100." in included[3]
     assert included[3].endswith("a 2,400.")
 
 
