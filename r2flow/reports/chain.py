@@ -42,7 +42,7 @@ _WORDS = ("far better than", "better than", "about as good as", "worse than", "f
 _NEXT = """
 next, with your own scans in FOLDER (.pcd, .ply, .bin, ...); step by step: docs/tutorial.md
   r2flow complete FOLDER --out dense                                     # add beams to them
-  r2flow train experiment=finetune stage.parent=street data.root=FOLDER  # fine-tune on hundreds
+  r2flow train experiment=finetune stage.parent=street data.root=FOLDER  # fine-tune street
 without scans
   r2flow sample street --num 16 --out scans                              # generate street scenes"""
 
@@ -68,7 +68,7 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
     captions = [row["title"] for row in rows]
     labels = [link_label(one, model.config) for one, model in makers.items()]
     if rows[-1]["scans"] == DEFAULT:
-        labels.append(f"{DEFAULT} (included in r2flow, larger)")
+        labels.append(f"{DEFAULT} (a larger model, included)")
     about = f"{', '.join(labels)}. An evaluation runs the network once."
     said = []
     then = what_next(runs[name], out, last.config | {"data": first.config.get("data", {})})
@@ -84,8 +84,8 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
             longer = f"chain.{next(iter(runs))}.trainer.max_steps={10 * first.step}"
             then = f"{_NEXT}\nlonger training: the same command with name=longer {longer}"
         about += (
-            f"\nDistance of {_SCANS} scans of each to {len(unseen)} unseen scans: smaller is "
-            f"better, and that of the {_GOAL} is the best to expect."
+            f"\nDistance from {_SCANS} scans of each to {len(unseen)} unseen ones. Smaller is "
+            f"better, 5 % is no difference; the best to expect is that of the {_GOAL}."
         )
     page = compare_page({run.label: [run] for run in read_runs(list(runs.values()))})
     page = replace(page, text=[about, table(rows, _COLUMNS), "\n".join(said), *page.text])
@@ -97,7 +97,7 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
     print("", *said, sep="\n")
     print(
         f"""
-look first    {out / "steps.png"}: a scan of each flow; black: no return
+look first    {out / "steps.png"}: one scan of each; black: no return
 in 3-D        {out / "samples.html"}: four scans of {name}, in a browser
 point clouds  {out / "000000.ply"} ... of {name}
 details       {page_path}
@@ -179,7 +179,8 @@ def _conclusion(rows: Sequence[Row], images: int) -> list[str]:
     *_, baseline = rows
     limit = _RATIOS[1] * baseline["distance"]
     near = [row["title"] for row in flows if row["distance"] < limit] or ["no flow"]
-    said = [f"Clearly better than {baseline['scans']}: {', '.join(near)}."]
+    about = f"Clearly better than {baseline['scans']} after {images:,} images"
+    said = [f"{about}: {', '.join(near)}. Longer training helps."]
     latest: dict[Any, Row] = {}  # by cost
     for row in flows:
         cost = row["solver"], row["calls"]
@@ -189,7 +190,7 @@ def _conclusion(rows: Sequence[Row], images: int) -> list[str]:
     best = min(flows, key=lambda row: row["distance"])
     for row in rows:
         if row["scans"] == DEFAULT:
-            seen = f"{DEFAULT} has seen over a million images, {flows[0]['scans']} {images:,}."
+            seen = f"{DEFAULT} has seen over a million images."
             said.append(f"{_compare(row, best | {'scans': best['title']})} {seen}")
     return [f"- {sentence}" for sentence in said]
 

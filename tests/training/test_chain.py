@@ -159,15 +159,15 @@ def test_the_conclusion_follows_the_distances():
     rows = [row("a", 0.3), row("a", 0.2, 2.0), row("b", 0.1), row("b", 0.205, 2.0)]
     baseline = {"scans": "noise", "distance": 0.21}
     told = [
-        "- Clearly better than noise: b in 1.",
+        "- Clearly better than noise after 2,400 images: b in 1. Longer training helps.",
         "- b in 1 is far better than a: 0.100 against 0.300.",
         "- b in 2 is about as good as a: 0.205 against 0.200.",
     ]
     assert _conclusion([*rows, baseline], 2400) == told
     included = _conclusion([*rows, row(DEFAULT, 0.3), baseline | {"distance": 0.1}], 2400)
-    assert included[0] == "- Clearly better than noise: no flow."
+    assert ": no flow. " in included[0]
     assert f"- {DEFAULT} in 1 is far worse than b in 1: 0.300 against 0.100." in included[3]
-    assert included[3].endswith("a 2,400.")
+    assert included[3].endswith("over a million images.")
 
 
 def test_a_finished_chain_is_not_run_again(chained: tuple[Path, str], scans: Path, tmp_path: Path):
