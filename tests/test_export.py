@@ -17,15 +17,8 @@ from r2flow.base.noise import Draws
 from r2flow.generators import RectifiedFlow, build_generator
 from r2flow.lidar.sensors import SENSORS
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.model.export import (
-    NOTES,
-    _traced,
-    compare,
-    compare_completion,
-    export,
-    export_completion,
-    tableau,
-)
+from r2flow.model.completion_export import compare_completion, export_completion
+from r2flow.model.export import NOTES, compare, export, tableau, traced
 from r2flow.samplers import build_sampler
 from tests.conftest import ROOT, tiny_options
 
@@ -121,7 +114,7 @@ def test_a_velocity_of_ones_own_is_not_exported_as_the_network(network, words, t
 
 def test_a_network_that_torch_cannot_export_is_refused():
     with pytest.raises(InputError, match="torch cannot export this Flatten: "):
-        _traced(torch.nn.Flatten(5), torch.tensor(0.5))
+        traced(torch.nn.Flatten(5), torch.tensor(0.5))
 
 
 def test_an_export_leaves_the_model_as_it_was_and_takes_a_samplers_name(tmp_path):

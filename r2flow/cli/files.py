@@ -98,7 +98,7 @@ def _export_completion(model: "Checkpoint", out: Path, source: str, size: Any) -
     """Export a transfer flow for scans of a sensor, completed in the view of `complete`."""
     from r2flow.data.partial import seeing_all
     from r2flow.lidar.sensors import named_sensor
-    from r2flow.model.export import compare_completion, export_completion
+    from r2flow.model.completion_export import compare_completion, export_completion
 
     sensor = named_sensor(source)
     view = named_sensor(model.sensor, size)

@@ -13,38 +13,26 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy, deepcopy
-from math import pi
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from r2flow import __version__
-from r2flow.base.errors import InputError, check, require
+from r2flow.base.errors import InputError, require
 from r2flow.base.files import write_file
 from r2flow.base.noise import Draws
 from r2flow.base.registry import Config, Registry
-from r2flow.data.opening import open_scans
-from r2flow.data.reading import Reading
-from r2flow.flow.maps import jump
-from r2flow.generators import USUAL, RectifiedFlow, Sampler, TransferFlow, condition_of
-from r2flow.generators.base import KNOWN, Generated
+from r2flow.generators import USUAL, RectifiedFlow, Sampler
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.lidar.known import Ray
-from r2flow.lidar.projection import image_to_points, unproject
-from r2flow.lidar.sensors import Sensor, named_sensor
-from r2flow.lidar.sight import Sight
+from r2flow.lidar.projection import unproject
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.saving import weights_hash
-from r2flow.samplers import Jump
 
 log = logging.getLogger(__name__)
 
-_SLOW = "torch exports the network: this takes up to some minutes"
-_SCAN = "(2 or 1, H, W): range in metres, reflectance of [0, 1]; 0: no return"
-_POINTS = "(M, 4): x ahead, y left, z up in metres, reflectance"
+SLOW = "torch exports the network: this takes up to some minutes"
 NOTES = "r2flow.json"  # metadata file in a .pt2; an .onnx has the key `r2flow`
 
 
@@ -151,50 +139,6 @@ def _weighted_sum(row: list[float], vectors: list[Tensor]) -> Tensor:
     return sum(a * v for a, v in zip(row, vectors, strict=False) if a)  # type: ignore[return-value]
 
 
-class _OneJump(Sampler):
-    """`Jump` with steps=1, without times that a graph would compute."""
-
-    needs = "map"
-
-    def __call__(
-        self, generator: Any, noise: Tensor, condition: Any, draws: Any, progress: Any
-    ) -> Generated:
-        start, end = noise.new_tensor([0, 1])
-        return Generated.after(jump(generator.map(condition), start, noise, end), 1)
-
-
-class _Completion(nn.Module):
-    """Points of a scan, (N, 4), to the completed image and points, as `complete` with seed 0."""
-
-    noise: Tensor
-
-    def __init__(self, flow: TransferFlow, source: Sensor) -> None:
-        super().__init__()
-        self.flow = flow
-        self.sight = Sight(source, flow.space.sensor)
-        self.register_buffer("noise", Draws(0, [0]).start(flow.noise_shape))
-
-    def forward(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        space = self.flow.space
-        image, state, xyz = self.sight(points)
-        # The third channel, without a label, lets reflectance of only 0 count as not measured.
-        images = torch.cat([image, torch.zeros_like(image[:1])])[None]
-        condition = condition_of(space, images, state[None])
-        x_1 = self.flow(self.noise, condition, sampler=_OneJump()).x
-        channels = 1 + space.encoding.reflectance
-        known = condition[KNOWN][0, :channels] > 0
-        scan = torch.where(known, image[:channels], space.decode(x_1)[0, :channels])
-        scan = scan * (scan[:1] > 0)
-        rays = space.rays
-        measured = state == Ray.RETURN
-        xyz = torch.where(measured, xyz, unproject(scan[None, :1], rays)[0])
-        strength = scan[1:2] if channels > 1 else torch.zeros_like(scan)
-        order = (rays[1, 0] % (2 * pi)).argsort()
-        values = torch.cat([xyz, strength, measured[None]])[..., order].flatten(1).mT
-        returned = (scan[0][:, order] > 0).flatten().nonzero()[:, 0]
-        return scan, values[returned, :4], values[returned, 4] > 0
-
-
 class Exported(NamedTuple):
     path: Path
     notes: Config  # metadata
@@ -238,57 +182,15 @@ def export(
     steps = None if network else tableau(flow, how)
     if write is _write_onnx:
         require("an .onnx", "export", "onnx", "onnxscript", "onnxruntime")
-    notes = _notes(checkpoint, how, steps)
-    log.info(_SLOW)
-    with _unfused():
+    notes = notes_of(checkpoint, how, steps)
+    log.info(SLOW)
+    with unfused():
         data = write(deepcopy(flow), steps, notes)  # tracing moves and changes it
     write_file(path, data)
     return Exported(path, notes)
 
 
-def export_completion(checkpoint: Checkpoint, path: str | Path, source: Sensor | str) -> Exported:
-    """Write a transfer flow as an `.onnx` that completes a scan, as `Checkpoint.complete` does.
-
-    The input is `points` (N, 4) float32: x ahead, y left, z up in metres, and reflectance of [0,
-    1], throughout 0 if unknown. The outputs are `scan` (2 or 1, H, W), range in metres and
-    reflectance, 0 without a return, `completed` (M, 4), its points as the input's, and `measured`
-    (M,) bool, which of these are points of the input, unchanged.
-
-    Args:
-        checkpoint: Of the sensor of the completed scan (`Checkpoint.through`).
-        source: Sensor of the points, or its name or YAML file.
-
-    Raises:
-        InputError: another suffix, generator or sampler, a sensor that already has all rays, or a
-            missing package.
-    """
-    path = Path(path)
-    flow = checkpoint.generator
-    source = named_sensor(source)
-    rows, columns = checkpoint.sensor.shape
-    own = source.shape[0] >= rows and source.resized(rows, columns).same_image(checkpoint.sensor)
-    if not isinstance(flow, TransferFlow):
-        raise InputError(f"{checkpoint.path} is no transfer flow, as densify: use `export`.")
-    check(not flow.classes, f"{checkpoint.path} has labels, which no file completes: give densify.")
-    check(path.suffix == ".onnx", f"a transfer flow is exported as .onnx, found {path}.")
-    check(flow.sampler == Jump(steps=1), "only a transfer flow with the sampler jump is exported.")
-    check(not own, f"scans of {source.name} have all rows of {checkpoint.sensor}: give more rows.")
-    require("an .onnx", "export", "onnx", "onnxscript", "onnxruntime")
-    from r2flow.model.onnx_graphs import to_onnx
-
-    log.info(_SLOW)
-    module = _Completion(deepcopy(flow.at(flow.space, numbered=False)), source)
-    notes = _notes(checkpoint, flow.sampler, None)
-    notes |= {"source": source.described(), "outputs": {"scan": _SCAN, "completed": _POINTS}}
-    with _unfused():
-        program = _traced(module, torch.zeros(1024, 4))
-        model = to_onnx(program, ["points"], ["scan", "completed", "measured"])
-    model.metadata_props.add(key="r2flow", value=json.dumps(notes))
-    write_file(path, model.SerializeToString())
-    return Exported(path, notes)
-
-
-def _notes(checkpoint: Checkpoint, how: Sampler, steps: Tableau | None) -> Config:
+def notes_of(checkpoint: Checkpoint, how: Sampler, steps: Tableau | None) -> Config:
     space = checkpoint.generator.space
     notes = {
         "r2flow": __version__,
@@ -314,9 +216,9 @@ def _notes(checkpoint: Checkpoint, how: Sampler, steps: Tableau | None) -> Confi
 
 def _write_pt2(flow: RectifiedFlow, how: Tableau | None, notes: Config) -> bytes:
     if how is None:
-        program = _traced(flow.backbone, *_network_inputs(flow, (2,)))
+        program = traced(flow.backbone, *_network_inputs(flow, (2,)))
     else:
-        program = _traced(_Scans(flow, how), torch.zeros(2, *flow.noise_shape))
+        program = traced(_Scans(flow, how), torch.zeros(2, *flow.noise_shape))
     file = io.BytesIO()
     torch.export.save(program, file, extra_files={NOTES: json.dumps(notes)})
     return file.getvalue()
@@ -326,9 +228,9 @@ def _write_onnx(flow: RectifiedFlow, how: Tableau | None, notes: Config) -> byte
     from r2flow.model.onnx_graphs import sampler_graph, to_onnx
 
     inputs = _network_inputs(flow, (2,) if how is None else ())
-    network = to_onnx(_traced(flow.backbone, *inputs), ["t", "x", "s"][: len(inputs)], ["v"])
+    network = to_onnx(traced(flow.backbone, *inputs), ["t", "x", "s"][: len(inputs)], ["v"])
     if how is not None:
-        decoded = _traced(_Decoded(flow.space), torch.zeros(2, *flow.noise_shape))
+        decoded = traced(_Decoded(flow.space), torch.zeros(2, *flow.noise_shape))
         ends = to_onnx(decoded, ["x_1"], ["scan", "points"])
         network = sampler_graph(network, ends, how.times, how.second, how.states.numpy())
     network.metadata_props.add(key="r2flow", value=json.dumps(notes))
@@ -345,7 +247,7 @@ def _network_inputs(flow: RectifiedFlow, shape: tuple[int, ...]) -> list[Tensor]
     return inputs[: 2 + flow.backbone.second_time]
 
 
-def _traced(module: nn.Module, *inputs: Tensor) -> torch.export.ExportedProgram:
+def traced(module: nn.Module, *inputs: Tensor) -> torch.export.ExportedProgram:
     batch = torch.export.Dim("batch", max=1 << 31)  # torch 2.6 refuses a size without a limit
     shapes = tuple({0: batch} if value.ndim else {} for value in inputs)
     module = module.cpu().eval()
@@ -359,7 +261,7 @@ def _traced(module: nn.Module, *inputs: Tensor) -> torch.export.ExportedProgram:
 
 
 @contextmanager
-def _unfused() -> Iterator[None]:
+def unfused() -> Iterator[None]:
     """Disable fused operations, which runtimes may lack, and warnings of the exporters."""
     fast = torch.backends.mha.get_fastpath_enabled()
     torch.backends.mha.set_fastpath_enabled(False)
@@ -393,22 +295,10 @@ def compare(
     noise = Draws(0, range(num)).start(flow.noise_shape)
     expected, _ = _Decoded(flow.space)(flow(noise, sampler=sampler).x)
     found = run(exported.path, noise)["scan"]
-    return _difference(expected, found)
+    return difference(expected, found)
 
 
-def compare_completion(checkpoint: Checkpoint, exported: Exported, source: Sensor) -> Difference:
-    """Compare the completed image of a simulated scan by the file and by the flow."""
-    import onnxruntime
-
-    image = open_scans("simulated:0", Reading(source), num=1).source[0]
-    points = np.column_stack(image_to_points(image, source))
-    session = onnxruntime.InferenceSession(exported.path, providers=["CPUExecutionProvider"])
-    (found,) = session.run(["scan"], {"points": points})
-    expected = checkpoint.complete(points, sensor=source, precision="32-true")[0]
-    return _difference(expected, torch.from_numpy(found)[None])
-
-
-def _difference(expected: Tensor, found: Tensor) -> Difference:
+def difference(expected: Tensor, found: Tensor) -> Difference:
     other = (expected[:, :1] > 0) != (found[:, :1] > 0)
     apart = (expected - found).abs().masked_fill(other, 0)
     reflectance = apart[:, 1:].max() if len(apart[0]) > 1 else 0.0

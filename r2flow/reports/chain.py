@@ -167,7 +167,7 @@ def _with_distances(
     best, name = min((distance(scans[:].numpy()), name) for name, scans in baselines)
     return [
         *({**row, "distance": distance(images)} for row, images in drawn),
-        {"scans": f"{name} (no network)", "distance": best},
+        {"scans": f"{name}, no network", "distance": best},
     ]
 
 
@@ -178,9 +178,10 @@ def _conclusion(rows: Sequence[Row], images: int) -> list[str]:
     flows = [row for row in rows if "calls" in row and row["scans"] != DEFAULT]
     *_, baseline = rows
     limit = _RATIOS[1] * baseline["distance"]
-    near = [row["title"] for row in flows if row["distance"] < limit] or ["no flow"]
-    about = f"Clearly better than {baseline['scans']} after {images:,} images"
-    said = [f"{about}: {', '.join(near)}. Longer training helps."]
+    near = [row["title"] for row in flows if row["distance"] < limit]
+    about = f"{len(near)} of {len(flows)} are clearly better than {baseline['scans']}"
+    names = f" ({', '.join(near)})" if near else ""
+    said = [f"After {images:,} images {about}{names}. Longer training helps."]
     latest: dict[Any, Row] = {}  # by cost
     for row in flows:
         cost = row["solver"], row["calls"]

@@ -111,8 +111,8 @@ def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
         "pairs/s",
         "[2/3] rf2 (straightened): ",
         "rf1 (trained on scans), rf2 (straightened), td2 (distilled)",
-        " (no network)",
-        "- Clearly better than ",
+        ", no network",
+        " are clearly better than ",
         "r2flow sample",
     ):
         assert words in said
@@ -159,13 +159,13 @@ def test_the_conclusion_follows_the_distances():
     rows = [row("a", 0.3), row("a", 0.2, 2.0), row("b", 0.1), row("b", 0.205, 2.0)]
     baseline = {"scans": "noise", "distance": 0.21}
     told = [
-        "- Clearly better than noise after 2,400 images: b in 1. Longer training helps.",
+        "- After 2,400 images 1 of 4 are clearly better than noise (b in 1). Longer training helps.",
         "- b in 1 is far better than a: 0.100 against 0.300.",
         "- b in 2 is about as good as a: 0.205 against 0.200.",
     ]
     assert _conclusion([*rows, baseline], 2400) == told
     included = _conclusion([*rows, row(DEFAULT, 0.3), baseline | {"distance": 0.1}], 2400)
-    assert ": no flow. " in included[0]
+    assert "0 of 4 are clearly better than noise. " in included[0]
     assert f"- {DEFAULT} in 1 is far worse than b in 1: 0.300 against 0.100." in included[3]
     assert included[3].endswith("over a million images.")
 
