@@ -111,7 +111,7 @@ def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
         "pairs/s",
         "[2/3] rf2 (straightened): ",
         "rf1 (trained on scans), rf2 (straightened), td2 (distilled)",
-        ", no network",
+        "needs no network",
         " are clearly better than ",
         "r2flow sample",
     ):
