@@ -105,14 +105,16 @@ def contact_sheet(
     titles: Sequence[str] = (),
     unmeasured: np.ndarray | None = None,
 ) -> Figure:
-    """Draw several scans in their common view, one per row: range and reflectance on the left,
-    bird's-eye view and perspective on the right.
+    """Draw several scans in their common view, one per row: range, reflectance and labels on the
+    left, bird's-eye view and perspective on the right.
 
     Rays of the first scan that were not measured, (H, W) bool, are grey.
     """
+    labels = [image[2] if len(image) > 2 and image[2].any() else None for image in images]
     images = [image[:2] for image in images]
     view = view_of(*((image, rays) for image in images))
-    height = 1.35 * len(images) + 0.18
+    labelled = any(one is not None for one in labels)
+    height = (1.85 if labelled else 1.35) * len(images) + 0.18
     figure = Figure((_WIDTH, height), facecolor="white")
     grid = figure.add_gridspec(
         len(images),
@@ -123,16 +125,18 @@ def contact_sheet(
         left=0.01,
         right=0.94,
         top=1 - 0.18 / height,
-        bottom=0.02,
+        bottom=0.14 / height if labelled else 0.02,  # below is a legend
     )
     for row, image in enumerate(images):
         label = row == 0
-        cells = grid[row, 0].subgridspec(len(image), 1, hspace=0.25)
+        cells = grid[row, 0].subgridspec(len(image) + labelled, 1, hspace=0.25)
         strips = [figure.add_subplot(cells[channel]) for channel in range(len(image))]
         _draw_image(strips, image, view, label)
         xyz, _ = image_to_points(image, rays)
         _draw_birds_eye(figure.add_subplot(grid[row, 1]), xyz, view, label)
         _draw_perspective(figure.add_subplot(grid[row, 2]), xyz, view, label)
+        if (classes := labels[row]) is not None:
+            _draw_labels(figure.add_subplot(cells[-1]), semantic_ids(classes))
         if label and unmeasured is not None:
             grey = np.where(unmeasured[..., None], (0.6, 0.6, 0.6, 1), 0)
             for axes in strips:

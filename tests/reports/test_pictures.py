@@ -36,6 +36,15 @@ def test_unmeasured_rays_are_grey_in_the_first_scan_alone():
     assert np.array_equal(grey, hidden)
 
 
+def test_classes_of_labelled_scans_have_a_strip_and_a_legend():
+    scan = image(np.full_like(E, 10.0))
+    road = np.concatenate([scan, (E < 0)[None], scan[1:]])  # class 1 below the horizon
+    figure = contact_sheet([scan, road], SENSOR.rays())
+    (axes,) = [axes for axes in figure.axes if axes.get_legend()]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["road"]
+    assert np.array_equal(axes.images[0].get_array().any(2), E < 0)
+
+
 def test_a_picture_is_as_wide_as_a_page_and_white(tmp_path, caplog):
     figure = scan_figure(image(np.full_like(E, 10.0)), SENSOR.rays())
     assert figure.get_figwidth() == pytest.approx(7.16)
