@@ -49,7 +49,8 @@ class LearnFromDensify(Transfer):
         t = (4 * u - 3).clamp(min=0)  # 3/4 of the images at t = 0
         noise = batch["x_0"][:, :, : x_1.shape[2], : x_1.shape[3]]
         rows = flow.rows(batch["elevations"], batch["steps"], batch["numbered"])
-        foreign = ~batch["numbered"]
+        shared = flow.rows.weight[0][:, None]  # of rows that have no vector of their own
+        foreign = (rows[:, :ROW, :, 0] == shared).all(2).all(1)
         offset = STEEP * RAISED * (3 * torch.rand(len(rows), device=rows.device) - 1) * foreign
         shifted = rows.clone()
         shifted[:, ROW] += offset[:, None, None]

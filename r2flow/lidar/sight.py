@@ -136,7 +136,7 @@ def _rows(elevation: Tensor, sensor: Sensor) -> Tensor:
     """As `rows_of`; H outside the view."""
     edges = torch.from_numpy(-sensor.row_edges).to(elevation.device)
     row = ((TIE - elevation).double()[:, None] >= edges).sum(1) - 1
-    return row % (len(edges))
+    return row % len(edges)
 
 
 def _groups(group: Tensor, groups: int) -> tuple[Tensor, Tensor]:
