@@ -259,6 +259,86 @@ def test_an_exported_completion_is_that_of_the_flow(tmp_path):
     np.testing.assert_allclose(np.sort(ranges), np.sort(scan[0][scan[0] > 0]), rtol=1e-5)
 
 
+@pytest.fixture(scope="module")
+def completion(tmp_path_factory):
+    """A flow, the sensor of its scans, and a session of its export."""
+    runtime = pytest.importorskip("onnxruntime", reason="the extra 'export'")
+    pytest.importorskip("onnxscript", reason="the extra 'export'")
+    checkpoint = flow("local", "transfer_flow")
+    source = replace(SENSORS["hdl64e"].resized(8, 128), name="eight")
+    written = export_completion(checkpoint, tmp_path_factory.mktemp("onnx") / "f.onnx", source)
+    return checkpoint, source, runtime.InferenceSession(written.path)
+
+
+def spheres(source, *radii: float) -> np.ndarray:
+    """Points of all rays of a sensor at the distances, one after another, with reflectance 0.5."""
+    e, a = source.rays().double().numpy().reshape(2, -1)
+    r = np.resize(radii, e.shape)
+    xyz = [r * np.cos(e) * np.cos(a), r * np.cos(e) * np.sin(a), r * np.sin(e)]
+    return np.stack([*xyz, np.full_like(e, 0.5)], axis=1).astype(np.float32)
+
+
+NAN = np.full((3, 4), np.nan, np.float32)
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        lambda scan: scan[:0],
+        lambda scan: NAN,
+        lambda scan: 0 * scan,  # at the origin: rays without a return
+        lambda scan: scan * np.float32([400, 400, 400, 1]),  # beyond the range
+        lambda scan: scan * np.float32([1e-2, 1e-2, 1e-2, 1]),  # nearer than it
+        lambda scan: np.float32([[0, 0, 5, 1], [0, 0, 9, 1]]),  # outside the view
+    ],
+)
+def test_a_scan_without_a_return_in_view_is_refused_and_in_an_export_stays_empty(odd, completion):
+    checkpoint, source, session = completion
+    points = odd(spheres(source, 9.0))
+    scan, completed, measured = session.run(None, {"points": points})
+    assert not scan.any()
+    assert completed.shape == (0, 4)
+    assert measured.shape == (0,)
+    with pytest.raises(InputError):
+        checkpoint.complete(points, sensor=source, precision="32-true")
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        lambda scan: scan[200:201],
+        lambda scan: scan[200:202],
+        lambda scan: np.repeat(scan[200:201], 9, axis=0),
+        lambda scan: np.concatenate([scan[:99], NAN, 0 * scan[:9], scan[99:]]),
+        lambda scan: scan[np.abs(scan[:, 1]) < -0.3 * scan[:, 0]],  # at the turn's seam alone
+        lambda scan: scan[::-1],
+    ],
+)
+def test_an_export_completes_odd_scans_as_the_flow_does(odd, completion):
+    checkpoint, source, session = completion
+    points = np.ascontiguousarray(odd(spheres(source, 9.0, 30.0, 79.0)))
+    scan, completed, measured = session.run(None, {"points": points})
+    (expected,) = checkpoint.complete(points, sensor=source, precision="32-true")[0].numpy()
+    np.testing.assert_allclose(scan, expected, atol=2e-3)
+    assert len(completed) == np.count_nonzero(expected[0])
+    given = points[np.isfinite(points).all(axis=1)]
+    assert measured.sum() > 0
+    assert set(map(tuple, completed[measured])) <= set(map(tuple, given))
+
+
+def test_an_exported_completion_says_what_it_takes(completion):
+    _, source, session = completion
+    said = [*session.get_inputs(), *session.get_outputs()]
+    assert [value.name for value in said] == ["points", "scan", "completed", "measured"]
+    assert [value.shape for value in said] == [["N", 4], [2, 16, 64], ["M", 4], ["M"]]
+    (beside,) = Path(session._model_path).parent.glob("*.json")
+    notes = json.loads(beside.read_text())
+    assert notes == json.loads(session.get_modelmeta().custom_metadata_map["r2flow"])
+    assert notes["image"] == [2, 16, 64]
+    assert notes["source"] == json.loads(json.dumps(source.described()))
+    assert (notes["sensor"]["min_range"], notes["sensor"]["max_range"]) == (1.45, 80)
+
+
 @pytest.mark.parametrize(
     ("name", "words"), [("flow.pt2", "is exported as .onnx"), ("flow.onnx", "have all rows")]
 )

@@ -38,6 +38,7 @@ from r2flow.model.export import (
 from r2flow.samplers import Jump
 
 _SCAN = "(2 or 1, H, W): range in metres, reflectance of [0, 1]; 0: no return"
+_AXES = {"points": "N", "completed": "M", "measured": "M"}
 _POINTS = "(M, 4): x ahead, y left, z up in metres, reflectance"
 
 
@@ -74,7 +75,8 @@ class _Completion(nn.Module):
         channels = 1 + space.encoding.reflectance
         known = condition[KNOWN][0, :channels] > 0
         scan = torch.where(known, image[:channels], space.decode(x_1)[0, :channels])
-        scan = scan * (scan[:1] > 0)
+        # A scan without a return in view has nothing to complete.
+        scan = scan * ((scan[:1] > 0) & (state == Ray.RETURN).any())
         rays = space.rays
         measured = state == Ray.RETURN
         xyz = torch.where(measured, xyz, unproject(scan[None, :1], rays)[0])
@@ -91,7 +93,8 @@ def export_completion(checkpoint: Checkpoint, path: str | Path, source: Sensor |
     The input is `points` (N, 4) float32: x ahead, y left, z up in metres, and reflectance of [0,
     1], throughout 0 if unknown. The outputs are `scan` (2 or 1, H, W), range in metres and
     reflectance, 0 without a return, `completed` (M, 4), its points as the input's, and `measured`
-    (M,) bool, which of these are points of the input, unchanged.
+    (M,) bool, which of these are points of the input, unchanged. A scan without a return in view
+    gives M = 0. A `.json` beside the file has its metadata: sensors, size, limits, weights.
 
     Args:
         checkpoint: Of the sensor of the completed scan (`Checkpoint.through`).
@@ -121,9 +124,10 @@ def export_completion(checkpoint: Checkpoint, path: str | Path, source: Sensor |
     notes |= {"source": source.described(), "outputs": {"scan": _SCAN, "completed": _POINTS}}
     with unfused():
         program = traced(module, torch.zeros(1024, 4))
-        model = to_onnx(program, ["points"], ["scan", "completed", "measured"])
+        model = to_onnx(program, ["points"], ["scan", "completed", "measured"], _AXES)
     model.metadata_props.add(key="r2flow", value=json.dumps(notes))
     write_file(path, model.SerializeToString())
+    write_file(path.with_suffix(".json"), json.dumps(notes))
     return Exported(path, notes)
 
 

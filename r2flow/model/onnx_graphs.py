@@ -1,6 +1,6 @@
 """ONNX graphs of a flow; needs the extra `export`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from onnx import TensorProto
 from onnx.compose import add_prefix
 from onnx.helper import make_graph, make_model, make_node, make_tensor_value_info
 from onnx.inliner import inline_local_functions
-from onnx.numpy_helper import from_array
+from onnx.numpy_helper import from_array, to_array
 from onnx.parser import parse_function
 
 # `r2flow.generators.surroundings._before` of `parts`, (L, B, blocks, W), in which row `l` of each
@@ -86,9 +86,14 @@ Before <turning, ring> (parts, steps) => (offsets) {
 
 
 def to_onnx(
-    program: torch.export.ExportedProgram, inputs: Sequence[str], outputs: Sequence[str]
+    program: torch.export.ExportedProgram,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    axes: Mapping[str, str] | None = None,
 ) -> onnx.ModelProto:
-    """Convert a traced module to ONNX with these names; the first dimension is called `batch`."""
+    """Convert a traced module to ONNX with these names; a first dimension that is not fixed is
+    called as in `axes`, else `batch`.
+    """
     converted = torch.onnx.export(
         program,
         (),
@@ -105,13 +110,31 @@ def to_onnx(
     for value in (*graph.input, *graph.output):
         del value.metadata_props[:]
         sizes = value.type.tensor_type.shape.dim
-        if len(sizes) and sizes[0].dim_param[:1] not in ("", "u"):  # u: of the outputs alone
-            sizes[0].dim_param = "batch"
+        if len(sizes) and sizes[0].dim_param:
+            sizes[0].dim_param = (axes or {}).get(value.name, "batch")
     for node in graph.node:
         del node.metadata_props[:]  # source locations in torch and r2flow
     if any(node.domain == BEFORE.domain for node in graph.node):
         model = _inlined(model)
+    _shrink(model.graph)
     return model
+
+
+def _shrink(graph: onnx.GraphProto) -> None:
+    """Store large constants of one value as their shape and value."""
+    uniform = []
+    for constant in graph.initializer:
+        values = to_array(constant)
+        if values.size > 1024 and (values == values.flat[0]).all():
+            uniform.append((constant, values))
+    for constant, values in uniform:
+        shape = from_array(np.array(values.shape), f"{constant.name}.shape")
+        value = from_array(values.flat[:1])
+        graph.node.insert(
+            0, make_node("ConstantOfShape", [shape.name], [constant.name], value=value)
+        )
+        graph.initializer.remove(constant)
+        graph.initializer.append(shape)
 
 
 def _inlined(model: onnx.ModelProto) -> onnx.ModelProto:
