@@ -27,8 +27,11 @@ def export(
     checkpoint: ModelArgument,
     how: SamplerOptions,
     to: Annotated[
-        Literal["onnx", "pt2", "safetensors"],
-        Option(help="onnx (onnxruntime and others), pt2 (torch) or safetensors (r2flow)."),
+        Literal["onnx", "pt2", "safetensors", "web"],
+        Option(
+            help="onnx (onnxruntime and others), pt2 (torch), safetensors (r2flow), or web: a "
+            "folder with a page that completes scans in the browser."
+        ),
     ] = "onnx",
     what: Annotated[
         Literal["sampler", "network"],
@@ -37,6 +40,13 @@ def export(
     source: Annotated[
         str | None,
         Option("--from", help="Of densify: sensor of the scans to complete, name or YAML file."),
+    ] = None,
+    sensor: Annotated[
+        str | None,
+        Option(
+            help="Of densify: sensor of the completed scans, whose limits hold. Default: as of "
+            "r2flow complete."
+        ),
     ] = None,
     size: SizeOption = None,
     half: Annotated[
@@ -63,6 +73,9 @@ def export(
 
     network = what == "network"
     name = checkpoint.stem if checkpoint.is_file() else checkpoint.resolve().name
+    if to == "web":
+        _export_web(checkpoint, out or Path("try"), source)
+        return
     out = out or Path(f"{name}-network.{to}" if network else f"{name}.{to}")
     if out.suffix != f".{to}" or out.is_dir():
         raise InputError(f"--to {to} writes a .{to}, found --out {out}.")
@@ -80,9 +93,12 @@ def export(
         if source is None:
             raise InputError("name the sensor of the scans: --from vlp16, or its YAML file.")
         check(not (network or how.given), "densify is exported whole, as one jump.")
-        _export_completion(loaded, out, source, size)
+        _export_completion(loaded, out, source, sensor, size)
         return
-    check(not (source or size), "--from and --size are for models that complete, as densify.")
+    check(
+        not (source or sensor or size),
+        "--from, --sensor and --size are for models that complete, as densify.",
+    )
     # Other generators are refused whatever their sampler.
     sampler = None
     if isinstance(loaded.generator, RectifiedFlow):
@@ -94,18 +110,32 @@ def export(
         print(f"compared with the flow: {writing.compare(loaded, written, sampler)}")
 
 
-def _export_completion(model: "Checkpoint", out: Path, source: str, size: Any) -> None:
+def _export_web(checkpoint: Path, out: Path, source: str | None) -> None:
+    """Write the page for the usual sensors, or for one."""
+    from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.reports.web import SENSORS, write_web
+
+    write_web(load_checkpoint(checkpoint), out, [source] if source else SENSORS)
+    print(f"{out}: python -m http.server --directory {out}, then open http://localhost:8000")
+
+
+def _export_completion(
+    model: "Checkpoint", out: Path, source: str, sensor: str | None, size: Any
+) -> None:
     """Export a transfer flow for scans of a sensor, completed in the view of `complete`."""
     from r2flow.data.partial import seeing_all
     from r2flow.lidar.sensors import named_sensor
     from r2flow.model.completion_export import compare_completion, export_completion
 
-    sensor = named_sensor(source)
-    view = named_sensor(model.sensor, size)
-    model = model.through(seeing_all(sensor, view) or view)
-    written = export_completion(model, out, sensor)
-    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, scans of {sensor.name} to {model.sensor}")
-    print(f"compared with the flow: {compare_completion(model, written, sensor)}")
+    seen = named_sensor(source)
+    view = named_sensor(sensor or model.sensor, size)
+    if not sensor:
+        view = seeing_all(seen, view) or view
+    model = model.through(view)
+    written = export_completion(model, out, seen)
+    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, scans of {seen.name} to {view}")
+    print(f"returns from {view.min_range:g} to {view.max_range:g} m are used")
+    print(f"compared with the flow: {compare_completion(model, written, seen)}")
 
 
 @app.command(

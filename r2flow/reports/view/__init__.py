@@ -29,7 +29,7 @@ from r2flow.lidar.labels import semantic_ids
 from r2flow.reports.pictures import class_colours, colours, view_of
 
 MOST = 256 * 64 * 1024  # maximum pixels of all images of a page: about 33 MB
-_STEP = 0.004  # metres per range code: uint16 reaches 262 m with errors of at most 2 mm
+STEP = 0.004  # metres per range code: uint16 reaches 262 m with errors of at most 2 mm
 _CODES = 2**16
 _SCALES = ("range", "height", "reflectance")  # in the order of `view.js`
 
@@ -60,18 +60,30 @@ def page(panels: Sequence[Panel], title: str = "r2flow") -> str:
     """
     # Only "<" could end the script element.
     data = json.dumps(_contents(panels), separators=(",", ":"), allow_nan=False)
-    folder = files(__package__)
-    style = folder.joinpath("view.css").read_text("utf-8")
-    script = folder.joinpath("view.js").read_text("utf-8")
+    return document(title, data.replace("<", "\\u003c"))
+
+
+def document(title: str, data: str) -> str:
+    """The page around its data, a JSON text."""
+    style, script = assets()
     # The content security policy allows only this script and this style, by hash.
-    return Template(folder.joinpath("view.html").read_text("utf-8")).substitute(
+    return Template(_asset("view.html")).substitute(
         title=html.escape(printable(title)),
-        data=data.replace("<", "\\u003c"),
+        data=data,
         style=style,
         script=script,
-        style_hash=_digest(style),
-        script_hash=_digest(script),
+        style_hash=digest(style),
+        script_hash=digest(script),
     )
+
+
+def assets() -> tuple[str, str]:
+    """Style and script of the page."""
+    return _asset("view.css"), _asset("view.js")
+
+
+def _asset(name: str) -> str:
+    return files(__package__).joinpath(name).read_text("utf-8")
 
 
 def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
@@ -89,14 +101,14 @@ def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
     labelled = [panel.labels[panel.labels > 0] for panel in panels if panel.labels is not None]
     classes = class_colours(np.concatenate(labelled), most=255) if labelled else {}
     farthest = max(np.nan_to_num(panel.images[:, 0], posinf=0).max() for panel in panels)
-    step = max(_STEP, float(farthest) / (_CODES - 1))
+    step = max(STEP, float(farthest) / (_CODES - 1))
     scans = []
     for panel in panels:
         angles = np.asarray(panel.rays, dtype=np.float64)
         key = angles.tobytes()
         if key not in sensors:
             sensors[key] = len(sensors)
-            described.append(_described(angles))
+            described.append(described_rays(angles))
         classified: Any = [None] * len(panel.images)
         if panel.labels is not None:
             classified = _class_numbers(panel.labels, classes)
@@ -113,7 +125,6 @@ def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
             }
         )
     view = view_of(*((panel.images[0], panel.rays) for panel in panels))
-    table = [colours(name)(np.arange(256), bytes=True) for name in _SCALES]
     return {
         "scans": scans,
         "rays": described,
@@ -121,7 +132,7 @@ def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
         "metres": step,
         "ranges": view.ranges,
         "heights": view.heights,
-        "colours": _base64(np.stack(table).tobytes()),
+        "colours": colour_table(),
         "classes": [("no class", "#808080"), *classes.values()],
         "legend": list(dict(classes.values()).items()),
         "shown": {
@@ -129,6 +140,12 @@ def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
             "label": bool(labelled),
         },
     }
+
+
+def colour_table() -> str:
+    """256 colours of each scale, in base64."""
+    table = [colours(name)(np.arange(256), bytes=True) for name in _SCALES]
+    return _base64(np.stack(table).tobytes())
 
 
 def write_viewer(path: Path, panels: Sequence[Panel], title: str = "r2flow") -> Path:
@@ -159,7 +176,7 @@ def _packed_image(image: ndarray, step: float, numbers: ndarray | None = None) -
     return _base64(zlib.compress(b"".join(planes), 6))
 
 
-def _described(rays: ndarray) -> dict[str, Any]:
+def described_rays(rays: ndarray) -> dict[str, Any]:
     """Rays, (2, H, W), as elevations of rows and azimuths of columns, which all sensors have."""
     elevations = rays[0, :, 0]
     azimuths = rays[1, 0]
@@ -181,7 +198,8 @@ def _class_numbers(ids: ndarray, classes: dict[int, tuple[str, str]]) -> ndarray
     return table[ids]
 
 
-def _digest(text: str) -> str:
+def digest(text: str) -> str:
+    """Hash of a text in a content security policy."""
     return "sha256-" + _base64(hashlib.sha256(text.encode()).digest())
 
 
