@@ -36,7 +36,7 @@ class EMA(WeightAveraging):
     def __init__(
         self,
         decay: Portion = 0.995,
-        every: Count = 10,
+        every: Count = 2,
         warmup_steps: Natural | None = None,
         rule: str = "power",
     ) -> None:

@@ -22,7 +22,7 @@ from r2flow.base.registry import Registry
 from r2flow.cli.options import SETS
 from r2flow.cli.verbs import app
 from r2flow.runs.composing import CONF
-from r2flow.stages import STAGES
+from r2flow.stages import STAGES, Stage
 
 TABLES = {"stage": STAGES, "backbone": BACKBONES}  # whose docstrings say what keys mean
 DOCS = Path(__file__).resolve().parent
@@ -45,7 +45,7 @@ def plain(annotation: Any) -> str:
     """An annotation or a signature without modules, bounds and quotes."""
     text = annotation.__name__ if isinstance(annotation, type) else str(annotation)
     text = re.sub(
-        r"Annotated\[(\w+), (?:\w+\((?:[^()]|\([^()]*\))*\)|<[^>]*>)\]",
+        r"Annotated\[(\w+)(?:, (?:\w+\((?:[^()]|\([^()]*\))*\)|<[^>]*>))+\]",
         r"\1",
         re.sub(r"\b(?:[a-z_]\w*\.)+(?=\w)", "", text),
     )
@@ -55,6 +55,21 @@ def plain(annotation: Any) -> str:
     text = re.sub(r"PosixPath\(('.*?')\)", r"\1", text)
     text = re.sub(r"(= \w+)\(.*<function .*>.*?'\)", r"\1(...)", text)
     return re.sub(r"(: |-> )'([^']*)'", r"\1\2", text)
+
+
+def own_arguments(thing: Any) -> inspect.Signature:
+    """A signature; of a stage, `**stage` stands for the arguments that `Stage` has, too."""
+    whole = inspect.signature(thing)
+    if not inspect.isclass(thing) or thing is Stage or not issubclass(thing, Stage):
+        return whole
+    shared = inspect.signature(Stage).parameters
+    own = [
+        one
+        for name, one in whole.parameters.items()
+        if name not in shared or one.default != shared[name].default
+    ]
+    rest = inspect.Parameter("stage", inspect.Parameter.VAR_KEYWORD)
+    return whole.replace(parameters=[*own, rest])
 
 
 def signatures(*places: str) -> Iterator[str]:
@@ -73,7 +88,7 @@ def signatures(*places: str) -> Iterator[str]:
         call = (
             ""
             if isinstance(thing, property)
-            else plain(inspect.signature(thing)).removesuffix(" -> None")
+            else plain(own_arguments(thing)).removesuffix(" -> None")
         )
         call = call.replace("(self, ", "(").replace("(self)", "()")
         yield f"{module + '.' if '.' not in names else ''}{names}{call}\n    # {first(inspect.getdoc(thing))}"

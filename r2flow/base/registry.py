@@ -11,6 +11,7 @@ from importlib.resources import files
 from pkgutil import resolve_name
 from typing import Annotated, Any, ClassVar, NamedTuple, NotRequired, Required, TypeVar
 
+from annotated_types import Ge, Gt, Le, Lt
 from omegaconf import OmegaConf
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, with_config
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
@@ -25,13 +26,13 @@ Config = dict[str, Any]  # a config, or a part of one
 MISSING = "???"  # OmegaConf's mandatory value
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
 
-Count = Annotated[int, Field(ge=1)]
-Natural = Annotated[int, Field(ge=0)]
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
-Seed = Annotated[int, Field(ge=0, lt=2**63)]
-Portion = Annotated[float, Field(ge=0, lt=1)]
-Share = Annotated[float, Field(ge=0, le=1)]
+Count = Annotated[int, Ge(1)]
+Natural = Annotated[int, Ge(0)]
+Positive = Annotated[float, Gt(0)]
+NonNegative = Annotated[float, Ge(0)]
+Seed = Annotated[int, Ge(0), Lt(2**63)]
+Portion = Annotated[float, Ge(0), Lt(1)]
+Share = Annotated[float, Ge(0), Le(1)]
 Counts = Annotated[Sequence[Count], Field(min_length=1)]
 Size = tuple[Count, Count]  # rows and columns
 
@@ -51,8 +52,14 @@ def Bound(words: str, holds: Callable[[Any], bool]) -> AfterValidator:
     return AfterValidator(validate)
 
 
+# Names of options in other packages.
+_OTHER_NAMES = {"lr": "learning_rate", "num_workers": "workers", "data_dir": "root"}
+
+
 def did_you_mean(name: str, known: Options | list[str]) -> str:
     """' Did you mean ...?' with the closest known name, or an empty string if there is none."""
+    if _OTHER_NAMES.get(name) in known:
+        return f" Did you mean '{_OTHER_NAMES[name]}'?"
     others = [other for other in known if other != name]  # as a broken link
     close = difflib.get_close_matches(name, others, n=1, cutoff=0.6)
     close += [other for other in others if other.startswith(name)]

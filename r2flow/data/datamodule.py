@@ -4,7 +4,7 @@ import hashlib
 import logging
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,8 +13,9 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
+from r2flow.base.arguments import NamedArguments
 from r2flow.base.errors import InputError
-from r2flow.base.registry import construct
+from r2flow.base.registry import Count, Natural, NonNegative, Options, Seed, construct
 from r2flow.base.signals import init_loader_worker
 from r2flow.data.augment import Augmentation
 from r2flow.data.loader import (
@@ -28,7 +29,15 @@ from r2flow.data.loader import (
     RunSampler,
 )
 from r2flow.data.opening import Described
-from r2flow.data.options import PAIRS, SIMULATED, DataOptions, PairOptions, PartOptions
+from r2flow.data.options import (
+    PAIRS,
+    SIMULATED,
+    DataOptions,
+    PairOptions,
+    PartOptions,
+    ReadingOptions,
+    ValidationOptions,
+)
 from r2flow.data.pairs import PairDataset, PairStore
 from r2flow.data.reading import AUTO, Reading
 from r2flow.data.resolving import lacking_reflectance, plan_data, reflectance_levels
@@ -41,7 +50,7 @@ log = logging.getLogger(__name__)
 Scans = Mixture | np.ndarray  # scans, or the numbers of pairs
 
 
-class ScanDataModule(L.LightningDataModule):
+class ScanDataModule(L.LightningDataModule, NamedArguments):
     """Projected scans with their noise, or pairs that a flow has drawn, for training and
     validation.
 
@@ -58,7 +67,20 @@ class ScanDataModule(L.LightningDataModule):
         encoding: Encoding of the images, a name in conf/encoding, or options; `reflectance: auto`
             looks at the scans.
         seed: Seed of noise, times and order.
-        options: Further fields of `r2flow.data.options.DataOptions`: root, split, batch_size, ...
+        root: Folder of the scans; of `pairs` that of the pairs.
+        split: Part of the data set's standard split; None: all.
+        drives: Names or numbers of drives; None: all.
+        scenes: Number of simulated scenes.
+        reading: How scan files become images, `r2flow.data.options.ReadingOptions`; None: as the
+            data set's kind does.
+        parts: Sets of scans of `mixed`, each with the keys of `r2flow.data.options.PartOptions`.
+        augment: Changes of training scans, `r2flow.data.augment.Augmentation`; None: none.
+        batch_size: Images of an optimiser step, over all devices and accumulated parts.
+        workers: Processes that read scans, for each device.
+        memory_gib: Training scans up to this size are kept in memory.
+        validation: Scans to hold out, `r2flow.data.options.ValidationOptions`.
+        pairs: Pairs to draw, `r2flow.data.options.PairOptions`.
+        scans: Scans next to pairs, `r2flow.data.options.SourceOptions`, for a flow map; None: none.
 
     Raises:
         InputError: an unknown name or option.
@@ -69,11 +91,27 @@ class ScanDataModule(L.LightningDataModule):
         name: str = SIMULATED,
         sensor: Sensor | str | Mapping[str, Any] = "hdl64e",
         encoding: Encoding | str | Mapping[str, Any] = "logscale",
-        seed: int = 0,
-        **options: Any,
+        seed: Seed = 0,
+        *,
+        root: str | int | None = None,
+        split: str | None = None,
+        drives: Sequence[str | int] | None = None,
+        scenes: Count = 512,
+        reading: ReadingOptions | Options | None = None,
+        parts: Sequence[Options] | None = None,
+        augment: Options | None = None,
+        batch_size: Count = 4,
+        workers: Natural = 0,
+        memory_gib: NonNegative = 2.0,
+        validation: ValidationOptions | Options | None = None,
+        pairs: PairOptions | Options | None = None,
+        scans: Options | None = None,
     ) -> None:
+        arguments = dict(locals())
         super().__init__()
-        self.options = construct("data", DataOptions, {"name": name, **options})
+        options = {one.name: arguments[one.name] for one in fields(DataOptions)}
+        given = {key: value for key, value in options.items() if value is not None}
+        self.options = construct("data", DataOptions, given)
         self.seed = seed
         self.batch_size = self.options.batch_size
         self._sensor_options = sensor_options(sensor)

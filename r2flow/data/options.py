@@ -128,7 +128,7 @@ class DataOptions(SourceOptions):
     parts: Sequence[Mapping[str, Any]] | None = None
     # `r2flow.data.augment.Augmentation`, of training scans only
     augment: Mapping[str, Any] | None = None
-    batch_size: Count = 8  # images in one optimiser step, over all devices and accumulated batches
+    batch_size: Count = 4  # images in one optimiser step, over all devices and accumulated batches
     workers: Annotated[int, Field(ge=0, le=1000)] = 0  # loader processes per device
     # training scans that fit into this are kept in memory, others read when needed
     memory_gib: NonNegative = 2.0

@@ -10,9 +10,10 @@ from typing import Any, ClassVar
 import lightning as L
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
+from r2flow.base.arguments import NamedArguments
 from r2flow.base.errors import InputError, naming
 from r2flow.base.noise import seed_torch
 from r2flow.base.plugins import loaded_plugins
@@ -36,9 +37,17 @@ from r2flow.stages.muon import Muon
 _BEYOND = 1.1  # largest value of a scan in model space, with some tolerance
 
 Batch = dict[str, Tensor]
+BackboneLike = str | nn.Module | Options | None
+SensorLike = str | Sensor | Options | None
+EncodingLike = str | Encoding | Options | None
+GeneratorLike = str | Generator | Options | None
+ParentLike = str | Path | Parent | Options | None
+SamplerLike = str | Options | None
+TimeLike = str | Options
+Betas = tuple[Portion, Portion]
 
 
-class Stage(L.LightningModule):
+class Stage(L.LightningModule, NamedArguments):
     """Trains a generator. A subclass defines `training_step`.
 
     A batch has the keys `x_1`, scans in model space, (B, C, H, W); `x_0`, noise, (B, *noise_shape);
@@ -51,8 +60,8 @@ class Stage(L.LightningModule):
     for each of `own_optimizers()`.
 
     Args:
-        backbone: Name or options of the network, as in conf/backbone; None: the parent's, else
-            `hdit_tiny`.
+        backbone: Network v(t, x): a name or options, as in conf/backbone, or a module of one's own;
+            None: the parent's, else `hdit_tiny`.
         sensor: Sensor of the images, its name, file or options; None: the parent's, else `hdl64e`.
         encoding: Encoding of the images, a name in conf/encoding, or options; None: the parent's,
             else `logscale`.
@@ -60,13 +69,14 @@ class Stage(L.LightningModule):
             options above; None: the stage's, the parent's, or a rectified flow.
         parent: Run folder, checkpoint or model to start from, with its averaged weights.
         sampler: Name and options of the default sampler; None: the generator's.
-        few: Likewise for fewer steps than `sampler` has.
+        few: Name and options of a sampler for fewer steps than `sampler` has; None: `sampler`.
         seed: Seed of the first weights and of draws in training.
-        learning_rate: AdamW's learning rate; linear warm-up, then a cosine to 0 at the last step.
-        betas, weight_decay: AdamW's.
+        learning_rate: Learning rate of AdamW; linear warm-up, then a cosine to 0 at the last step.
+        betas: Decays of AdamW's averages of the gradient and of its square.
+        weight_decay: Weight decay of AdamW.
         muon: Learning rate of the weight matrices by `Muon`, with the same schedule; None: AdamW
             for all weights.
-        warmup_images: Images seen during the warm-up.
+        warmup_images: Images seen during the warm-up of the learning rate.
 
     Attributes:
         generator: The generator in training.
@@ -91,17 +101,17 @@ class Stage(L.LightningModule):
 
     def __init__(
         self,
-        backbone: str | Options | None = None,
-        sensor: str | Options | Sensor | None = None,
-        encoding: str | Options | Encoding | None = None,
-        generator: str | Options | Generator | None = None,
+        backbone: BackboneLike = None,
+        sensor: SensorLike = None,
+        encoding: EncodingLike = None,
+        generator: GeneratorLike = None,
         *,
-        parent: str | Path | Options | Parent | None = None,
-        sampler: str | Options | None = None,
-        few: str | Options | None = None,
+        parent: ParentLike = None,
+        sampler: SamplerLike = None,
+        few: SamplerLike = None,
         seed: Seed = 0,
         learning_rate: NonNegative = 2e-3,
-        betas: tuple[Portion, Portion] = (0.9, 0.99),
+        betas: Betas = (0.9, 0.99),
         weight_decay: NonNegative = 0.0,
         muon: NonNegative | None = None,
         warmup_images: Natural = 400,

@@ -2,19 +2,30 @@
 earlier flow.
 """
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from torch import Tensor
 
 from r2flow.base.errors import InputError
-from r2flow.base.registry import Count
+from r2flow.base.registry import Count, Natural, NonNegative, Seed
 from r2flow.flow.losses import LOSSES
 from r2flow.flow.path import interpolate
 from r2flow.flow.times import TIMES
 from r2flow.generators import Condition, Flow, Generator
 from r2flow.generators.flow import ode_sampler
 from r2flow.samplers import FixedSteps
-from r2flow.stages.base import Batch, Options, SingleLoss
+from r2flow.stages.base import (
+    BackboneLike,
+    Batch,
+    Betas,
+    EncodingLike,
+    GeneratorLike,
+    ParentLike,
+    SamplerLike,
+    SensorLike,
+    SingleLoss,
+    TimeLike,
+)
 
 
 class Rectify(SingleLoss):
@@ -22,29 +33,55 @@ class Rectify(SingleLoss):
     eq. 2).
 
     Args:
-        model: Backbone, sensor, encoding and generator, as in `Stage`.
-        loss: Name in `r2flow.flow.losses.LOSSES`; None: `default_loss`.
-        time: Name and options of a density in `r2flow.flow.times.TIMES`; None: `default_time`.
-        options: Those of `Stage`.
+        loss: Loss of the velocity, a name in `r2flow.flow.losses.LOSSES`.
+        time: Name and options of the density of t, in `r2flow.flow.times.TIMES`.
 
     Raises:
         InputError: the generator is not a flow or takes a condition; an unknown loss or density.
     """
 
     learns: ClassVar[type[Generator]] = Flow
-    default_loss = "mse"
-    default_time: ClassVar[Options] = {"name": "uniform"}
     generator: Flow
 
     def __init__(
-        self, *model: Any, loss: str | None = None, time: Options | None = None, **options: Any
+        self,
+        backbone: BackboneLike = None,
+        sensor: SensorLike = None,
+        encoding: EncodingLike = None,
+        generator: GeneratorLike = None,
+        *,
+        loss: str = "mse",
+        time: TimeLike = "uniform",
+        parent: ParentLike = None,
+        sampler: SamplerLike = None,
+        few: SamplerLike = None,
+        seed: Seed = 0,
+        learning_rate: NonNegative = 2e-3,
+        betas: Betas = (0.9, 0.99),
+        weight_decay: NonNegative = 0.0,
+        muon: NonNegative | None = None,
+        warmup_images: Natural = 400,
     ) -> None:
-        super().__init__(*model, **options)
+        super().__init__(
+            backbone,
+            sensor,
+            encoding,
+            generator,
+            parent=parent,
+            sampler=sampler,
+            few=few,
+            seed=seed,
+            learning_rate=learning_rate,
+            betas=betas,
+            weight_decay=weight_decay,
+            muon=muon,
+            warmup_images=warmup_images,
+        )
         if self.generator.takes_condition and type(self).condition is Rectify.condition:
             name = type(self.generator).__name__
             raise InputError(f"a {name} needs a condition: give stage=transfer, or its own stage.")
-        self.loss = LOSSES[loss or self.default_loss]
-        self.time = TIMES.build(time or self.default_time)
+        self.loss = LOSSES[loss]
+        self.time = TIMES.build(time)
 
     def condition(self, batch: Batch) -> Condition | None:
         """Condition of the velocity; None here."""
@@ -67,8 +104,43 @@ class Reflow(Rectify):
 
     needs_pairs = True
     takes_pairs = True
-    default_loss = "pseudo_huber"
-    default_time: ClassVar[Options] = {"name": "u_shaped", "a": 4.0}
+
+    def __init__(
+        self,
+        backbone: BackboneLike = None,
+        sensor: SensorLike = None,
+        encoding: EncodingLike = None,
+        generator: GeneratorLike = None,
+        *,
+        loss: str = "pseudo_huber",
+        time: TimeLike = "u_shaped",
+        parent: ParentLike = None,
+        sampler: SamplerLike = None,
+        few: SamplerLike = None,
+        seed: Seed = 0,
+        learning_rate: NonNegative = 2e-3,
+        betas: Betas = (0.9, 0.99),
+        weight_decay: NonNegative = 0.0,
+        muon: NonNegative | None = None,
+        warmup_images: Natural = 400,
+    ) -> None:
+        super().__init__(
+            backbone,
+            sensor,
+            encoding,
+            generator,
+            loss=loss,
+            time=time,
+            parent=parent,
+            sampler=sampler,
+            few=few,
+            seed=seed,
+            learning_rate=learning_rate,
+            betas=betas,
+            weight_decay=weight_decay,
+            muon=muon,
+            warmup_images=warmup_images,
+        )
 
     def prepare_generator(self) -> None:
         # The ODE alone: fresh noise on the way would break the pairing.
@@ -86,15 +158,42 @@ class Distill(Reflow):
     """
 
     def __init__(
-        self, *model: Any, steps: Count = 1, grid: str = "uniform", **options: Any
+        self,
+        backbone: BackboneLike = None,
+        sensor: SensorLike = None,
+        encoding: EncodingLike = None,
+        generator: GeneratorLike = None,
+        *,
+        steps: Count = 2,
+        grid: str = "uniform",
+        loss: str = "pseudo_huber",
+        parent: ParentLike = None,
+        sampler: SamplerLike = None,
+        few: SamplerLike = None,
+        seed: Seed = 0,
+        learning_rate: NonNegative = 2e-3,
+        betas: Betas = (0.9, 0.99),
+        weight_decay: NonNegative = 0.0,
+        muon: NonNegative | None = None,
+        warmup_images: Natural = 400,
     ) -> None:
-        super().__init__(*model, **options)
-        if options.get("time") is not None:
-            raise InputError(
-                f"a distilled flow trains at the {steps} times that its steps visit; leave time "
-                "out."
-            )
-        self.time = TIMES.build({"name": "discrete", "k": steps, "grid": grid})
+        super().__init__(
+            backbone,
+            sensor,
+            encoding,
+            generator,
+            loss=loss,
+            time={"name": "discrete", "k": steps, "grid": grid},
+            parent=parent,
+            sampler=sampler,
+            few=few,
+            seed=seed,
+            learning_rate=learning_rate,
+            betas=betas,
+            weight_decay=weight_decay,
+            muon=muon,
+            warmup_images=warmup_images,
+        )
 
     def prepare_generator(self) -> None:
         self.generator.run_by(FixedSteps(self.hparams["steps"], self.hparams["grid"]), fixed=True)

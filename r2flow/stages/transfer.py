@@ -3,13 +3,13 @@
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.base.registry import Count, Portion, construct
+from r2flow.base.registry import Count, Natural, NonNegative, Options, Portion, Seed, construct
 from r2flow.data.loader import ItemFormat
 from r2flow.generators import Generator, TransferFlow
 from r2flow.generators.base import IMAGE, KNOWN
@@ -19,7 +19,17 @@ from r2flow.lidar.encoding import ModelSpace
 from r2flow.lidar.known import Ray, every_row, random_points, random_rows
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.completion import complete
-from r2flow.stages.base import Batch, Options, SingleLoss
+from r2flow.stages.base import (
+    BackboneLike,
+    Batch,
+    Betas,
+    EncodingLike,
+    GeneratorLike,
+    ParentLike,
+    SamplerLike,
+    SensorLike,
+    SingleLoss,
+)
 
 
 @dataclass(frozen=True)
@@ -144,8 +154,39 @@ class Transfer(SingleLoss):
     generator_name = "transfer_flow"
     generator: TransferFlow
 
-    def __init__(self, *model: Any, tasks: Options | None = None, **options: Any) -> None:
-        super().__init__(*model, **options)
+    def __init__(
+        self,
+        backbone: BackboneLike = None,
+        sensor: SensorLike = None,
+        encoding: EncodingLike = None,
+        generator: GeneratorLike = None,
+        *,
+        tasks: Options | None = None,
+        parent: ParentLike = None,
+        sampler: SamplerLike = None,
+        few: SamplerLike = None,
+        seed: Seed = 0,
+        learning_rate: NonNegative = 2e-3,
+        betas: Betas = (0.9, 0.99),
+        weight_decay: NonNegative = 0.0,
+        muon: NonNegative | None = None,
+        warmup_images: Natural = 800,
+    ) -> None:
+        super().__init__(
+            backbone,
+            sensor,
+            encoding,
+            generator,
+            parent=parent,
+            sampler=sampler,
+            few=few,
+            seed=seed,
+            learning_rate=learning_rate,
+            betas=betas,
+            weight_decay=weight_decay,
+            muon=muon,
+            warmup_images=warmup_images,
+        )
         self.tasks = construct("stage.tasks", Tasks, tasks)
 
     @property

@@ -213,7 +213,12 @@ def test_scans_are_projected_as_the_run_says(numbered: Path):
 
 
 def test_validation_is_never_augmented_nor_drawn_anew_and_ranks_share_it(numbered: Path):
-    options = {"name": "folder", "root": str(numbered), "validation": {"share": 0.5}}
+    options = {
+        "name": "folder",
+        "root": str(numbered),
+        "validation": {"share": 0.5},
+        "batch_size": 8,
+    }
     plain = next(iter(module(**options).val_dataloader()))
     data = module(**options, augment={"flip": True, "roll": True})
     data.seed = 5

@@ -138,7 +138,7 @@ def test_the_paper_s_loss_and_times_are_the_defaults():
             {"name": "distill", "steps": 0},
             "stage 'distill': steps: input should be greater than or equal to 1",
         ),
-        ({"name": "distill", "steps": 2, "time": {"name": "uniform"}}, "leave time out"),
+        ({"name": "distill", "steps": 2, "time": {"name": "uniform"}}, r"no option 'time'; it has"),
     ],
 )
 def test_what_cannot_be_is_refused(options, message):

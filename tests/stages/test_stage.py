@@ -1,6 +1,8 @@
 """What all stages share: steps that a stage takes itself are those that Lightning would take."""
 
 import copy
+import inspect
+from typing import Any
 
 import pytest
 import torch
@@ -9,9 +11,10 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 from r2flow.base.errors import InputError
+from r2flow.data.datamodule import ScanDataModule
 from r2flow.generators import Generated, Generator
 from r2flow.samplers import FixedSteps
-from r2flow.stages import Stage
+from r2flow.stages import STAGES, Rectify, Stage
 from r2flow.stages.base import SingleLoss
 from r2flow.stages.muon import Muon, is_hidden_matrix, orthogonalised
 from tests.conftest import quiet_trainer
@@ -238,3 +241,27 @@ def test_a_closure_clears_the_gradients_of_all_weights():
     assert all(
         torch.equal(p, q) for p, q in zip(model.parameters(), other.parameters(), strict=True)
     )
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_every_argument_is_named_typed_and_described(name):
+    for kind in (STAGES[name], ScanDataModule):
+        for one in inspect.signature(kind).parameters.values():
+            assert one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY), one
+            assert one.annotation not in (one.empty, Any), one
+            assert one.default is not one.empty, one
+            assert f"\n    {one.name}: " in kind.__doc__, one
+
+
+@pytest.mark.parametrize(
+    ("wrong", "right"),
+    [
+        (lambda: Rectify(lr=1e-3), "learning_rate"),
+        (lambda: Rectify(backbon="hdit"), "backbone"),
+        (lambda: ScanDataModule(num_workers=2), "workers"),
+        (lambda: ScanDataModule(data_dir="scans"), "root"),
+    ],
+)
+def test_a_wrong_name_is_answered_with_the_right_one(wrong, right):
+    with pytest.raises(InputError, match=rf"has no argument '\w+'\. Did you mean '{right}'\?"):
+        wrong()

@@ -8,8 +8,27 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from r2flow.base.registry import Count, Natural, NonNegative, Options, Portion, Registry, construct
-from r2flow.stages.base import Batch, Stage
+from r2flow.base.registry import (
+    Count,
+    Natural,
+    NonNegative,
+    Options,
+    Portion,
+    Registry,
+    Seed,
+    construct,
+)
+from r2flow.stages.base import (
+    BackboneLike,
+    Batch,
+    Betas,
+    EncodingLike,
+    GeneratorLike,
+    ParentLike,
+    SamplerLike,
+    SensorLike,
+    Stage,
+)
 from r2flow.systems.gan import dcgan, style_discriminator
 from r2flow.systems.gan.augment import AdaptiveAugment, BatchDraws
 from r2flow.systems.gan.generator import Gan
@@ -89,6 +108,8 @@ DISCRIMINATORS = Registry(
 )
 
 
+_ALL_DEFAULTS: Options = {}
+
 # Parts of a step, with separate random draws per image.
 _GENERATOR = 1
 _FAKE = 2
@@ -111,9 +132,7 @@ class LearnGan(Stage):
         r1: gamma of R1; 0 for none.
         r1_every: Steps between two of R1.
         warmup: Options of `Warmup`.
-        augment: Options of `AdaptiveAugment`; None for no augmentation.
-
-    See `Stage` for the others.
+        augment: Options of `AdaptiveAugment`, without any its defaults; None: no augmentation.
     """
 
     learns = Gan
@@ -121,23 +140,42 @@ class LearnGan(Stage):
 
     def __init__(
         self,
-        *model: Any,
-        discriminator: Options | None = None,
-        betas: tuple[Portion, Portion] = (0.0, 0.99),
+        backbone: BackboneLike = None,
+        sensor: SensorLike = None,
+        encoding: EncodingLike = None,
+        generator: GeneratorLike = None,
+        *,
+        discriminator: str | Options = "dcgan",
         r1: NonNegative = 1.0,
         r1_every: Count = 16,
         warmup: Options | None = None,
-        augment: Options | None = None,
-        **options: Any,
+        augment: Options | None = _ALL_DEFAULTS,
+        parent: ParentLike = None,
+        sampler: SamplerLike = None,
+        few: SamplerLike = None,
+        seed: Seed = 0,
+        learning_rate: NonNegative = 2e-3,
+        betas: Betas = (0.0, 0.99),
     ) -> None:
-        super().__init__(*model, betas=betas, **{"warmup_images": 0, **options})
+        super().__init__(
+            backbone,
+            sensor,
+            encoding,
+            generator,
+            parent=parent,
+            sampler=sampler,
+            few=few,
+            seed=seed,
+            learning_rate=learning_rate,
+            betas=betas,
+            warmup_images=0,
+        )
         self.automatic_optimization = False
         self.r1 = r1
         self.r1_every = r1_every
         self.last_r1: Tensor | None = None
         channels, *shape = self.space.shape
-        chosen = discriminator or {"name": "dcgan"}
-        self.discriminator: nn.Module = DISCRIMINATORS.build(chosen, shape, channels)
+        self.discriminator: nn.Module = DISCRIMINATORS.build(discriminator, shape, channels)
         self.warmup = construct("stage.warmup", Warmup, warmup)
         self.augment = None
         if augment is not None:

@@ -7,9 +7,20 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.base.processes import mean_over_processes
-from r2flow.base.registry import Count, Natural, NonNegative, Options, construct
+from r2flow.base.registry import Count, Natural, NonNegative, Options, Seed, construct
 from r2flow.lidar.encoding import Encoding
-from r2flow.stages.base import Batch, SingleLoss, Stage
+from r2flow.stages.base import (
+    BackboneLike,
+    Batch,
+    Betas,
+    EncodingLike,
+    GeneratorLike,
+    ParentLike,
+    SamplerLike,
+    SensorLike,
+    SingleLoss,
+    Stage,
+)
 from r2flow.systems.diffusion.process import noised
 from r2flow.systems.latent.generator import LatentDiffusion, VQAutoencoder
 
@@ -107,7 +118,7 @@ class LearnAutoencoder(Stage):
             the other way round.
         codebook_weight: c.
         mask_factor: Weight of the mask's error, of an autoencoder with a mask.
-        options: Those of `Stage`. The learning rate does not fall.
+        learning_rate: Learning rate of AdamW, constant after a linear warm-up.
     """
 
     learns = VQAutoencoder
@@ -117,16 +128,42 @@ class LearnAutoencoder(Stage):
 
     def __init__(
         self,
-        *model: Any,
+        backbone: BackboneLike = None,
+        sensor: SensorLike = None,
+        encoding: EncodingLike = None,
+        generator: GeneratorLike = None,
+        *,
         discriminator: Options | None = None,
         adversarial_weight: NonNegative = 0.6,
         adversarial_start: Natural = 1,
         inverted: bool = False,
         codebook_weight: NonNegative = 1.0,
         mask_factor: NonNegative = 1.0,
-        **options: Any,
+        parent: ParentLike = None,
+        sampler: SamplerLike = None,
+        few: SamplerLike = None,
+        seed: Seed = 0,
+        learning_rate: NonNegative = 3.6e-5,
+        betas: Betas = (0.5, 0.9),
+        weight_decay: NonNegative = 0.0,
+        muon: NonNegative | None = None,
+        warmup_images: Natural = 0,
     ) -> None:
-        super().__init__(*model, **options)
+        super().__init__(
+            backbone,
+            sensor,
+            encoding,
+            generator,
+            parent=parent,
+            sampler=sampler,
+            few=few,
+            seed=seed,
+            learning_rate=learning_rate,
+            betas=betas,
+            weight_decay=weight_decay,
+            muon=muon,
+            warmup_images=warmup_images,
+        )
         self.automatic_optimization = False
         self.autoencoder = self.generator.first_stage_model
         channels = self.space.shape[0] + self.autoencoder.mask
@@ -179,7 +216,7 @@ class LearnLatentDiffusion(SingleLoss):
     drawn uniformly.
 
     Args:
-        options: Those of `Stage`. The learning rate does not fall.
+        learning_rate: Learning rate of AdamW, constant after a linear warm-up.
     """
 
     learns = LatentDiffusion
@@ -188,8 +225,38 @@ class LearnLatentDiffusion(SingleLoss):
     needs_parent = True
     anneals = False
 
-    def __init__(self, *model: Any, **options: Any) -> None:
-        super().__init__(*model, **options)
+    def __init__(
+        self,
+        backbone: BackboneLike = None,
+        sensor: SensorLike = None,
+        encoding: EncodingLike = None,
+        generator: GeneratorLike = None,
+        *,
+        parent: ParentLike = None,
+        sampler: SamplerLike = None,
+        few: SamplerLike = None,
+        seed: Seed = 0,
+        learning_rate: NonNegative = 1.6e-5,
+        betas: Betas = (0.9, 0.999),
+        weight_decay: NonNegative = 0.01,
+        muon: NonNegative | None = None,
+        warmup_images: Natural = 0,
+    ) -> None:
+        super().__init__(
+            backbone,
+            sensor,
+            encoding,
+            generator,
+            parent=parent,
+            sampler=sampler,
+            few=few,
+            seed=seed,
+            learning_rate=learning_rate,
+            betas=betas,
+            weight_decay=weight_decay,
+            muon=muon,
+            warmup_images=warmup_images,
+        )
         self.generator.first_stage_model.requires_grad_(False)
 
     def configure_optimizers(self) -> Any:

@@ -1,12 +1,20 @@
 """Training by denoising score matching."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from r2flow.base.registry import NonNegative
-from r2flow.stages.base import Batch, SingleLoss
+from r2flow.base.registry import Natural, NonNegative, Seed
+from r2flow.stages.base import (
+    BackboneLike,
+    Batch,
+    Betas,
+    EncodingLike,
+    GeneratorLike,
+    ParentLike,
+    SamplerLike,
+    SensorLike,
+    SingleLoss,
+)
 from r2flow.systems.score.generator import ScoreModel, score_loss
 
 
@@ -16,7 +24,7 @@ class MatchScore(SingleLoss):
 
     Args:
         power: Exponent of sigma in the weight of each level.
-        options: Those of `Stage`. The learning rate does not fall.
+        learning_rate: Learning rate of AdamW, constant after a linear warm-up.
     """
 
     learns = ScoreModel
@@ -24,8 +32,39 @@ class MatchScore(SingleLoss):
     generator_name = "score"
     anneals = False
 
-    def __init__(self, *model: Any, power: NonNegative = 2.0, **options: Any) -> None:
-        super().__init__(*model, **options)
+    def __init__(
+        self,
+        backbone: BackboneLike = None,
+        sensor: SensorLike = None,
+        encoding: EncodingLike = None,
+        generator: GeneratorLike = None,
+        *,
+        power: NonNegative = 2.0,
+        parent: ParentLike = None,
+        sampler: SamplerLike = None,
+        few: SamplerLike = None,
+        seed: Seed = 0,
+        learning_rate: NonNegative = 1e-4,
+        betas: Betas = (0.9, 0.999),
+        weight_decay: NonNegative = 0.0,
+        muon: NonNegative | None = None,
+        warmup_images: Natural = 0,
+    ) -> None:
+        super().__init__(
+            backbone,
+            sensor,
+            encoding,
+            generator,
+            parent=parent,
+            sampler=sampler,
+            few=few,
+            seed=seed,
+            learning_rate=learning_rate,
+            betas=betas,
+            weight_decay=weight_decay,
+            muon=muon,
+            warmup_images=warmup_images,
+        )
         self.power = power
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:
