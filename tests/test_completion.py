@@ -114,6 +114,27 @@ def test_spread_is_over_the_answers_with_a_return():
     torch.testing.assert_close(share, torch.tensor([[1, 1 / 3, 0]]))
 
 
+def test_each_answer_has_errors_of_its_added_points():
+    images = scans(1)
+    state = halved(images)
+    flow = network()
+    for how in ({"sampler": "jump", "steps": 1}, {"sampler": "transport"}):
+        (found,) = complete(flow, images, state, num=3, batch_size=2, **how)
+        likely, nearly_sure = found.error(0.68, 0.95)
+        added = (found.images[:, 0] > 0) & ~found.measured
+        assert torch.equal(likely > 0, added)
+        assert (nearly_sure >= likely).all()
+        assert torch.equal(
+            found.p_return[:, found.measured] > 0.5, found.images[:, 0][:, found.measured] > 0
+        )
+    (whole,) = complete(flow, images, ray_states(images))
+    assert not whole.error(0.68).any()
+    assert torch.equal(whole.p_return, (images[:, 0] > 0).float())
+    (other,) = complete(network("rectified_flow"), images, state)
+    assert other.error(0.68)[0].isnan().any()
+    assert other.p_return[:, ~other.measured].isnan().all()
+
+
 @pytest.mark.parametrize(
     ("sensor", "size", "other"), [("hdl64e", "32x256", False), ("vlp16", "16x256", True)]
 )

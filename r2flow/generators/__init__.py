@@ -6,6 +6,7 @@ from typing import Any
 import torch
 
 from r2flow.base.registry import Registry, lazy
+from r2flow.generators.answers import Answers
 from r2flow.generators.base import Condition, Generated, Generator, Sampler, condition_of
 from r2flow.generators.flow import USUAL, Flow, FlowMap, RectifiedFlow, as_flow
 from r2flow.generators.transfer import TransferFlow
@@ -14,6 +15,7 @@ from r2flow.lidar.encoding import build_space
 __all__ = [
     "GENERATORS",
     "USUAL",
+    "Answers",
     "Condition",
     "Flow",
     "FlowMap",

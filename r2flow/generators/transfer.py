@@ -114,6 +114,7 @@ class TransferFlow(Flow):
         self.rows = RowFeatures(self.elevations)
         self.numbered = True  # whether the vectors learned per row are used
         self.foreign = False  # whether the scans are of another sensor than the training scans
+        self.density: Answers | None = None  # of the last step of one call
 
     def start_from(self, parent: Generator) -> None:
         """Copy a transfer flow's weights; those of labels that it does not know begin at 0.
@@ -221,7 +222,9 @@ class TransferFlow(Flow):
         assert condition is not None
         t = torch.as_tensor(t, device=x.device, dtype=torch.float32)
         answers = self._answered(t, x, condition)
-        estimate = self._chosen if holds((torch.as_tensor(s) >= 1).all()) else self._mean
+        last = holds((torch.as_tensor(s) >= 1).all())
+        estimate = self._chosen if last else self._mean
+        self.density = answers if last else None
         x_1 = _with_known(condition, estimate(answers)).to(x)
         return ((x_1 - x) / (1 - expand_time(t, x)).clamp(min=_LAST)).to(x)
 
@@ -237,6 +240,7 @@ class TransferFlow(Flow):
         `residual`.
         """
         answers = self._answered(torch.zeros((), device=x_0.device), x_0, condition)
+        self.density = answers
         e = (x_0 - condition["start"])[:, :1].float() / max(self.sigma, 1e-6)
         u = torch.special.ndtr(smoothed(e, condition[KNOWN][:, :1] < 1, self.elevations))
         p = answers.returns.sigmoid()
@@ -336,14 +340,15 @@ class TransferFlow(Flow):
             with autocast(self.device, how.get("precision", "32-true")):
                 measured["share"] = self._share(measured, noise, steps)
         start = about.start + (known < 1) * noise
-        generated = super().forward(start, {**measured, **about._asdict()}, **how)
+        once = copy(self)  # threads share a generator
+        generated = Flow.forward(once, start, {**measured, **about._asdict()}, **how)
         x = generated.x.to(image)
         x = torch.where(within_reach(known.amax(1, True)), x, self._empty(image[:, :1]))
         x = torch.where(known > 0, image, x)
         # See `answers` and `_share`.
         twice = self.foreign and self.twice and hidden
         evaluations = generated.evaluations * (2 if twice else 1) + tested
-        return replace(generated, x=x, evaluations=evaluations)
+        return replace(generated, x=x, evaluations=evaluations, density=once.density)
 
     def loss(
         self,

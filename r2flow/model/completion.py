@@ -4,6 +4,7 @@ network's rounding.
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from r2flow.base.devices import multiplies_bfloat16
 from r2flow.base.errors import InputError, check
-from r2flow.generators import Flow, Generator, Sampler, TransferFlow, condition_of
+from r2flow.generators import Answers, Flow, Generator, Sampler, TransferFlow, condition_of
 from r2flow.generators.base import Precision, Progress
 from r2flow.lidar.encoding import LIMIT_TOLERANCE, wrong_with
 from r2flow.lidar.known import Ray, ray_states
@@ -20,8 +21,38 @@ from r2flow.model.sampling import HasGenerator, Samples, draw, warn_unsolved
 from r2flow.samplers import Transport, build_sampler, parse_sampler
 
 
+@dataclass(frozen=True)
 class Completed(Samples):
     """The answers to scan number `first`, with reflectance if the model has it."""
+
+    measured: Tensor = field(default_factory=lambda: torch.zeros(()) > 0)  #: rays, (H, W) bool
+    #: of each batch of answers; empty without a transfer flow, and where no ray is hidden
+    densities: tuple[Answers, ...] = ()
+
+    def error(self, *levels: float) -> Tensor:
+        """Metres along the ray within which the true range, if the ray returns, lies with these
+        probabilities, (levels, A, H, W) float32.
+
+        It is 0 for measured rays and those without a return. It is NaN for added points of a model
+        that predicts no density: all but transfer flows.
+        """
+        r = self.images[:, :1]
+        if not self.densities:
+            added = (r[:, 0] > 0) & ~self.measured
+            return torch.where(added, torch.nan, 0.0).expand(len(levels), *added.shape)
+        parts = r.split([len(one.returns) for one in self.densities])
+        pairs = zip(self.densities, parts, strict=True)
+        return torch.cat([one.error(part.to(one.returns), levels).cpu() for one, part in pairs], 1)
+
+    @property
+    def p_return(self) -> Tensor:
+        """Probability that a ray returns, (A, H, W) float32: 1 and 0 for measured rays; NaN for
+        hidden ones of a model that predicts no density.
+        """
+        if not self.densities:
+            returned = (self.images[:, 0] > 0).float()
+            return torch.where(self.measured, returned, torch.nan)
+        return torch.cat([one.returns.sigmoid()[:, 0].cpu() for one in self.densities])
 
     @property
     def spread(self) -> Tensor:
@@ -157,6 +188,7 @@ def complete(
         evaluations = answers.new_zeros(num).long()
         converged = answers.new_ones(num).bool()
         seconds = 0.0
+        densities = []
         for start in range(0, 0 if bool(known.all()) else num, batch_size):
             at = slice(start, min(start + batch_size, num))
             # of noise: 0 is sample i's
@@ -174,10 +206,20 @@ def complete(
                 drawn.converged,
             )
             seconds += drawn.seconds
+            if drawn.density is not None:
+                densities.append(drawn.density)
         shared = min(returns, image.shape[0])
         answers[:, :shared] = torch.where(measured, image[:shared], answers[:, :shared])
         warn_unsolved(converged, of=f" of the answers to scan {first + i}")
-        yield Completed(answers * (answers[:, :1] > 0), first + i, evaluations, converged, seconds)
+        yield Completed(
+            answers * (answers[:, :1] > 0),
+            first + i,
+            evaluations,
+            converged,
+            seconds,
+            measured=measured,
+            densities=tuple(densities),
+        )
 
 
 def label(source: HasGenerator | Generator, images: Tensor, **how: Any) -> Tensor:

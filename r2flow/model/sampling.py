@@ -12,7 +12,7 @@ from torch import Tensor
 
 from r2flow.base.errors import InputError, check
 from r2flow.base.noise import Draws
-from r2flow.generators import Condition, Generator, Sampler
+from r2flow.generators import Answers, Condition, Generator, Sampler
 from r2flow.generators.base import Precision, Progress
 from r2flow.lidar.region import Region
 
@@ -36,6 +36,7 @@ class Samples:
     evaluations: Tensor  #: network evaluations per scan, (B,)
     converged: Tensor  #: whether the sampler converged, per scan, (B,) bool
     seconds: float  #: generation time of the batch, without noise and decoding
+    density: Answers | None = None  #: of a transfer flow's answers
 
 
 def sample(
@@ -125,7 +126,12 @@ def draw(
     if region is not None:
         images = region.place(region.crop(evaluated.place(images)))
     return Samples(
-        images, numbers[0], generated.evaluations.cpu(), generated.converged.cpu(), seconds
+        images,
+        numbers[0],
+        generated.evaluations.cpu(),
+        generated.converged.cpu(),
+        seconds,
+        generated.density,
     )
 
 

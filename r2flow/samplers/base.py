@@ -32,6 +32,7 @@ class Generated:
     x: Tensor  #: x_1, (B, C, H, W), on the generator's device, float32 or float64
     evaluations: Tensor  #: network evaluations of each scan, (B,) int64
     converged: Tensor  #: whether each scan is finite and, for an adaptive method, solved, (B,) bool
+    density: Any = None  #: `r2flow.generators.answers.Answers` of the last step; None without one
 
     @classmethod
     def after(cls, x: Tensor, evaluations: int, converged: Tensor | None = None) -> Self:
