@@ -154,7 +154,7 @@ def config(group: str, *shown: str) -> Iterator[str]:
         entry = TABLES[group][file.stem] if file.stem in TABLES.get(group, ()) else None
         docs = (
             "\n".join(inspect.getdoc(one) or "" for one in reversed(inspect.getmro(entry)))
-            if entry
+            if inspect.isclass(entry)
             else ""
         )
         words = {

@@ -65,12 +65,17 @@ def __dir__() -> list[str]:
     return __all__
 
 
-def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoint":
+def load(
+    name: "str | Path",
+    device: "str | torch.device" = "cpu",
+    backbone: "torch.nn.Module | None" = None,
+) -> "Checkpoint":
     """Load a trained generator: a model by name (see `r2flow info`), a run folder or a checkpoint
     file.
 
     Args:
         device: cpu, cuda, cuda:1, ..., or auto: a GPU if available.
+        backbone: A module like the one that a model with a module of its user's was trained with.
 
     Raises:
         InputError: unknown model, unusable file or unavailable device.
@@ -78,7 +83,7 @@ def load(name: "str | Path", device: "str | torch.device" = "cpu") -> "Checkpoin
     from r2flow.base.devices import choose_device
     from r2flow.model.checkpoint import load_checkpoint
 
-    return load_checkpoint(name, choose_device(str(device), "device"))
+    return load_checkpoint(name, choose_device(str(device), "device"), backbone=backbone)
 
 
 @overload

@@ -139,7 +139,10 @@ def differing(group: str, constructor: Callable[..., Any], options: dict[str, An
 def test_conf_and_constructors_have_the_same_defaults(entries: list[Entry]):
     for group, constructor, options, _ in entries:
         # a preset has options of its own, and the Trainer's are those of a run of r2flow
-        whole = not group.startswith("backbone=") or group.removeprefix("backbone=") in BACKBONES
+        whole = (
+            not group.startswith("backbone=")
+            or group.removeprefix("backbone=") in BACKBONES._entries
+        )
         if whole and group != "trainer":
             assert differing(group, constructor, options) == [], group
 

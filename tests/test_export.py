@@ -138,7 +138,7 @@ def test_a_missing_package_names_its_extra_before_the_work_begins(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", BACKBONES)
+@pytest.mark.parametrize("name", BACKBONES._entries)
 def test_an_exported_sampler_gives_the_same_scans(name, kind, tmp_path):
     checkpoint = flow(name)
     written = export(checkpoint, tmp_path / f"flow.{kind}", SHORT)

@@ -1,5 +1,6 @@
 """Stages and scans in a Trainer of Lightning, as docs/lightning.md shows them."""
 
+import copy
 import re
 import subprocess
 import sys
@@ -42,7 +43,7 @@ def test_the_page_runs_block_by_block(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.chdir(tmp_path)
     names: dict = {}
     blocks = BLOCK.findall((ROOT / "docs" / "lightning.md").read_text())
-    assert len(blocks) == 8
+    assert len(blocks) == 9
     for number, (is_script, code) in enumerate(blocks):
         if is_script:
             script = tmp_path / "script.py"
@@ -279,3 +280,67 @@ def test_loaders_of_any_kind(tmp_path: Path):
         assert {"val/loss/dataloader_idx_0", "val/loss/dataloader_idx_1"} <= set(
             trainer.callback_metrics
         )
+
+
+class OwnNetwork(torch.nn.Module):
+    """v(t, x), with a convolution that sees t as a channel."""
+
+    def __init__(self, width: int = 4) -> None:
+        super().__init__()
+        self.first = torch.nn.Conv2d(3, width, 3, padding=1)
+        self.last = torch.nn.Conv2d(width, 2, 1)
+
+    def forward(self, t, x):
+        t = t[:, None, None, None].expand(-1, 1, *x.shape[2:])
+        return self.last(torch.relu(self.first(torch.cat([x, t], 1))))
+
+
+def test_any_module_is_a_velocity(tmp_path: Path):
+    network = OwnNetwork()
+    first = copy.deepcopy(network)
+    module = Rectify(network, SENSOR, warmup_images=8)
+    assert module.backbone is network
+    x = torch.randn(3, 2, 8, 64)
+    assert torch.equal(module(torch.tensor(0.25), x), network(torch.full((3,), 0.25), x))
+    last = tmp_path / "1rf.ckpt"
+    keep = ModelCheckpoint(tmp_path, filename="1rf", every_n_train_steps=2, monitor=None)
+    stop = StopAfter(2)  # of four, which the learning rate depends on
+    trainer = quiet_trainer(
+        tmp_path, max_steps=4, callbacks=[EMA(every=1), keep, stop], enable_checkpointing=True
+    )
+    trainer.fit(module, scans())
+    for load in (Rectify.load_from_checkpoint, r2flow.load, lambda path: Reflow(parent=path)):
+        with pytest.raises(InputError, match=r"is a OwnNetwork.*give backbone=OwnNetwork"):
+            load(last)
+    loaded = Rectify.load_from_checkpoint(last, backbone=OwnNetwork())
+    model = r2flow.load(last, backbone=OwnNetwork())
+    torch.testing.assert_close(loaded.sample(2, seed=3), model.sample(2, seed=3))
+    averaged = torch.load(last)["state_dict"]["generator.backbone.network.last.weight"]
+    assert torch.equal(loaded.backbone.last.weight, averaged)
+    ends = []
+    for start, path in ((OwnNetwork(), last), (first, None)):
+        trainer = quiet_trainer(tmp_path, max_steps=4, callbacks=[EMA(every=1)])
+        trainer.fit(Rectify(start, SENSOR, warmup_images=8), scans(), ckpt_path=path)
+        ends.append(start.last.weight)
+    assert torch.equal(*ends)
+
+
+def test_a_flow_of_any_module_is_straightened_and_distilled(tmp_path: Path):
+    trainer = quiet_trainer(tmp_path, max_steps=1)
+    trainer.fit(Rectify(OwnNetwork(), SENSOR), scans())
+    trainer.save_checkpoint(tmp_path / "1rf.ckpt")
+    data = ScanDataModule(
+        "pairs", pairs={"num": 8, "batch_size": 4, "sampler": {"name": "euler", "steps": 2}}
+    )
+    trainer = quiet_trainer(tmp_path, max_steps=1, callbacks=[ReflowPairs()])
+    straight = Reflow(backbone=OwnNetwork(), parent=tmp_path / "1rf.ckpt")
+    # the weights of the parent, not those that its own network had
+    first = torch.load(tmp_path / "1rf.ckpt")["state_dict"]
+    assert torch.equal(
+        straight.backbone.first.weight, first["generator.backbone.network.first.weight"]
+    )
+    trainer.fit(straight, data)
+    trainer.save_checkpoint(tmp_path / "2rf.ckpt")
+    student = Distill(backbone=OwnNetwork(), parent=tmp_path / "2rf.ckpt", steps=1)
+    assert student.hparams.parent["stage"] == "reflow"
+    assert student.sample(1).shape == (1, 2, 8, 64)

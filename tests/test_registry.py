@@ -3,6 +3,7 @@ from typing import Annotated
 
 import pytest
 
+from r2flow.backbones import BACKBONES
 from r2flow.base.errors import InputError
 from r2flow.base.registry import MISSING, Registry, check_options, options_of, presets
 
@@ -78,3 +79,10 @@ def test_of_several_bases_of_a_file_the_last_one_holds_as_in_hydra(tmp_path, mon
     (folder / "both.yaml").write_text("{defaults: [first, last, _self_], x: 3}")
     monkeypatch.setattr("r2flow.base.registry.files", lambda package: tmp_path)
     assert presets("several_bases")["both"] == {"x": 3, "y": 2, "z": 1}
+
+
+def test_the_names_of_backbones_are_those_of_the_error():
+    with pytest.raises(InputError) as error:
+        BACKBONES["hditt"]
+    assert f"known: {', '.join(BACKBONES)}. Did" in str(error.value)
+    assert BACKBONES["hdit_tiny"].keywords["base_channels"] == 48

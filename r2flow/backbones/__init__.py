@@ -1,30 +1,57 @@
 """Networks v(t, x) and u(x, t, s) by name, and their configurations in conf/backbone."""
 
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from r2flow.backbones.adm_unet import ADMUNet
 from r2flow.backbones.base import Backbone
 from r2flow.backbones.efficient_unet import EfficientUNet
 from r2flow.backbones.hdit import HDiT
 from r2flow.backbones.local import Local
+from r2flow.backbones.own import OWN, own_backbone
 from r2flow.backbones.vit import ViT
 from r2flow.base.errors import InputError
-from r2flow.base.registry import Config, Options, Registry, presets
+from r2flow.base.registry import Config, Options, Registry, construct, presets
 from r2flow.lidar.sensors import SENSORS
 
 
-class _Backbones(Registry[type[Backbone]]):
+class _Backbones(Registry[Callable[..., Backbone]]):
+    """Classes of backbones, and by the names of conf/backbone the same with options."""
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(sorted({*self._entries, *presets(self.kind)}))
+
+    def __len__(self) -> int:
+        return len({*self._entries, *presets(self.kind)})
+
+    def __contains__(self, name: object) -> bool:
+        return name in presets(self.kind) or super().__contains__(name)
+
+    def __getitem__(self, name: str) -> Callable[..., Backbone]:
+        if name in self._entries or name not in self:
+            return super().__getitem__(name)
+        options = dict(presets(self.kind)[name])
+        return partial(self[options.pop("name")], **options)
+
+    def options(self, given: str | Options | nn.Module) -> Config:
+        """As `Registry.options`; also of a module of one's own."""
+        if isinstance(given, nn.Module):
+            return {"name": OWN, "network": given}
+        return super().options(given)
+
     def build(  # type: ignore[override]
         self,
-        options: str | Options,
+        options: str | Options | nn.Module,
         rays: Tensor | None = None,
         *,
         shape: tuple[int, int, int] | None = None,
         **given: Any,
     ) -> Backbone:
-        """Build a backbone by name or options, as in conf/backbone, for images of some rays.
+        """Build a backbone by name or options, as in conf/backbone, or of a module of one's own,
+        for images of some rays.
 
         Args:
             rays: Elevation and azimuth in radians, (2, H, W).
@@ -34,7 +61,11 @@ class _Backbones(Registry[type[Backbone]]):
         if shape is not None:
             rays = SENSORS["hdl64e"].resized(*shape[1:]).rays()
             given["in_channels"] = shape[0]
-        return super().build({**self.options(options), **given}, rays)
+        chosen = {**self.options(options), **given}
+        if chosen["name"] == OWN:
+            del chosen["name"]
+            return construct("backbone 'own'", own_backbone, chosen, rays)
+        return super().build(chosen, rays)
 
 
 BACKBONES = _Backbones(

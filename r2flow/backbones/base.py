@@ -112,7 +112,7 @@ class Backbone(ExactBuffers):
         return (skip * image + out * self._velocity(t, inner, s)).to(x.dtype)
 
     def _velocity(self, t: Tensor, x: Tensor, s: Tensor | None) -> Tensor:
-        y = x.to(next(self.parameters()).dtype)
+        y = x.to(next(self.parameters(), x).dtype)
         v = self.velocity(t, y, s) if self.second_time else self.velocity(t, y)
         # not len(x), which torch.export would take for a constant
         expected = (x.shape[0], self.out_channels, *x.shape[2:])

@@ -5,6 +5,7 @@ execution.
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from r2flow.backbones import BACKBONES
 from r2flow.base.errors import IN_MEMORY, InputError, check, naming
 from r2flow.base.files import reading_errors
 from r2flow.base.plugins import made_with
@@ -231,13 +233,17 @@ class Checkpoint:
 
 @torch.inference_mode(False)  # `mmps` needs gradients later
 def load_checkpoint(
-    path: str | Path, device: str | torch.device = "cpu", averaged: bool = True
+    path: str | Path,
+    device: str | torch.device = "cpu",
+    averaged: bool = True,
+    backbone: nn.Module | None = None,
 ) -> Checkpoint:
     """Load a generator from a checkpoint file (of r2flow or published), a run folder, or by a
     model's name.
 
     The averaged weights are the default for evaluation; `averaged=False` loads the raw weights of
-    an r2flow run. Raises `InputError` without a usable checkpoint, or if the weights do not fit the
+    an r2flow run. `backbone`: a module like the one that the model was trained with; a copy takes
+    the weights. Raises `InputError` without a usable checkpoint, or if the weights do not fit the
     config.
     """
     path = find_checkpoint(path)
@@ -246,10 +252,10 @@ def load_checkpoint(
             if path.suffix == ".safetensors":
                 notes = read_safetensors(path)
                 checkpoint = _built(
-                    notes["config"], notes["weights"], notes, path, int(notes["step"])
+                    notes["config"], notes["weights"], notes, path, int(notes["step"]), backbone
                 )
             else:
-                checkpoint = _of_torch(read_checkpoint(path), path, averaged)
+                checkpoint = _of_torch(read_checkpoint(path), path, averaged, backbone)
     except InputError:
         raise
     except (
@@ -266,7 +272,7 @@ def load_checkpoint(
     return replace(checkpoint, generator=checkpoint.generator.to(device))
 
 
-def _of_torch(content: Any, path: Path, averaged: bool) -> Checkpoint:
+def _of_torch(content: Any, path: Path, averaged: bool, backbone: nn.Module | None) -> Checkpoint:
     """The generator of a torch file, of Lightning or of a published system."""
     published = next((known for known in FORMATS.values() if known.holds(content)), None)
     if published is not None:
@@ -281,7 +287,7 @@ def _of_torch(content: Any, path: Path, averaged: bool) -> Checkpoint:
                 "rays": "centre",
             }
         drawing = {"sampler": converted.sampler, "fixed": converted.fixed}
-        return _built(config, converted.weights, drawing, path, converted.step, "published")
+        return _built(config, converted.weights, drawing, path, converted.step, kind="published")
     if isinstance(content, dict) and {HYPER, NOTES, "state_dict"} <= content.keys():
         state: Any = (
             content["state_dict"]
@@ -298,7 +304,7 @@ def _of_torch(content: Any, path: Path, averaged: bool) -> Checkpoint:
             content[HYPER], content.get("datamodule_hyper_parameters") or {}, notes["stage"]
         )
         config |= {"plugins": notes["plugins"], "trainer": {"max_steps": notes["total_steps"]}}
-        return _built(config, weights, notes, path, int(content.get("global_step", 0)))
+        return _built(config, weights, notes, path, int(content.get("global_step", 0)), backbone)
     systems = ", ".join(known.system for known in FORMATS.values())
     found = (
         ", ".join(map(repr, list(content)[:6]))
@@ -318,6 +324,7 @@ def _built(
     drawing: Mapping[str, Any],
     path: Path,
     step: int,
+    backbone: nn.Module | None = None,
     kind: str = "r2flow",
 ) -> Checkpoint:
     """The generator of a config with its weights and default samplers."""
@@ -331,7 +338,8 @@ def _built(
     ):
         stack.callback(torch.set_default_dtype, torch.get_default_dtype())
         torch.set_default_dtype(torch.float32)
-        generator = build_generator(config)
+        network = {} if backbone is None else {"backbone": BACKBONES.options(deepcopy(backbone))}
+        generator = build_generator({**config, **network})
         check_weights(generator, weights)
         generator.load_state_dict(weights)
         if drawing.get("sampler"):

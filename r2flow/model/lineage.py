@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torch import nn
+
 from r2flow.backbones import BACKBONES
 from r2flow.base.errors import InputError
 from r2flow.base.registry import Config, Options, options_of
@@ -52,11 +54,15 @@ class Parent:
         }
 
 
-def find_parent(name: "str | Path | Parent") -> Parent:
-    """The parent of a name. A run folder must be finished, a checkpoint may be of any step."""
+def find_parent(name: "str | Path | Parent", backbone: Any = None) -> Parent:
+    """The parent of a name. A run folder must be finished, a checkpoint may be of any step.
+
+    A `backbone` that is a module of one's own is the parent's, too.
+    """
     if isinstance(name, Parent):
         return name
-    checkpoint = load_checkpoint(str(name))
+    network = backbone if isinstance(backbone, nn.Module) else None
+    checkpoint = load_checkpoint(str(name), backbone=network)
     total = checkpoint.config.get("trainer", {}).get("max_steps") or 0
     is_run = Path(str(name)).expanduser().is_dir() and name_of(checkpoint.path) is None
     if is_run and checkpoint.step < total:
@@ -157,7 +163,9 @@ def _generator(given: str | Options | None, theirs: Options | None, of_stage: st
 
 
 def plain(value: Any) -> Any:
-    """A value with its sequences as lists and its mappings as dicts."""
+    """A value with its sequences as lists, its mappings as dicts, and a module as its class."""
     if isinstance(value, Mapping):
         return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, nn.Module):
+        return type(value).__name__
     return [plain(item) for item in value] if isinstance(value, list | tuple) else value

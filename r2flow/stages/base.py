@@ -13,6 +13,7 @@ from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
+from r2flow.backbones.own import OwnNetwork
 from r2flow.base.arguments import NamedArguments
 from r2flow.base.errors import InputError, naming
 from r2flow.base.noise import seed_torch
@@ -30,7 +31,7 @@ from r2flow.model.checkpoint import check_weights
 from r2flow.model.lineage import Parent, find_parent, model_options, plain
 from r2flow.model.parts import COMPILED, MODEL, NOTES
 from r2flow.model.paths import step_of
-from r2flow.model.sampling import draw
+from r2flow.model.sampling import draw, sample
 from r2flow.samplers import build_sampler
 from r2flow.stages.muon import Muon
 
@@ -80,6 +81,7 @@ class Stage(L.LightningModule, NamedArguments):
 
     Attributes:
         generator: The generator in training.
+        own_network: Whether its network is a module of one's own, which no checkpoint can make.
         gradient_clip_val: Gradient clipping of a stage with manual optimisation, which Lightning
             leaves to it.
 
@@ -117,8 +119,11 @@ class Stage(L.LightningModule, NamedArguments):
         warmup_images: Natural = 400,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters(ignore=["parent", "sensor", "encoding", "generator"])
-        source = None if parent is None or isinstance(parent, Mapping) else find_parent(parent)
+        self.save_hyperparameters(ignore=["parent", *MODEL])
+        self.own_network = isinstance(backbone, nn.Module)
+        source = None
+        if parent is not None and not isinstance(parent, Mapping):
+            source = find_parent(parent, backbone)
         if isinstance(generator, Generator):
             self.generator = generator
             options: Config = dict.fromkeys(MODEL)
@@ -168,6 +173,12 @@ class Stage(L.LightningModule, NamedArguments):
     def space(self) -> ModelSpace:
         """Model space of the images."""
         return self.generator.space
+
+    @property
+    def backbone(self) -> nn.Module:
+        """The network v(t, x); a module of one's own as it was given."""
+        network: Any = self.generator.backbone
+        return network.network if isinstance(network, OwnNetwork) else network
 
     @property
     def encoding(self) -> Encoding:
@@ -290,6 +301,19 @@ class Stage(L.LightningModule, NamedArguments):
         seed_torch(
             self.hparams["seed"], "dropout", position * self.trainer.world_size + self.global_rank
         )
+
+    def sample(self, num: int = 1, seed: int = 0, **how: Any) -> Tensor:
+        """Scans 0 to num - 1 of a seed by the present weights, (num, 2 or 1, H, W): range in metres
+        and reflectance, 0 without a return.
+
+        Args:
+            how: Options of `r2flow.model.sampling.sample`: sampler, steps, batch_size, ...
+        """
+        training = self.training
+        self.eval()
+        images = [drawn.images for drawn in sample(self.generator, num, seed, **how)]
+        self.train(training)
+        return torch.cat(images)
 
     def predict_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> Tensor:
         """Scans of the numbers `k`: range in metres and reflectance, (B, 2 or 1, H, W), 0 without a

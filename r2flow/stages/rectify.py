@@ -83,6 +83,10 @@ class Rectify(SingleLoss):
         self.loss = LOSSES[loss]
         self.time = TIMES.build(time)
 
+    def forward(self, t: Tensor, x: Tensor) -> Tensor:
+        """v(t, x), (B, C, H, W), at times t of shape () or (B,)."""
+        return self.generator.velocity(t, x)
+
     def condition(self, batch: Batch) -> Condition | None:
         """Condition of the velocity; None here."""
         return None

@@ -14,7 +14,7 @@ from tests.conftest import tiny_options
 SHAPE = (16, 64)
 RAYS = rays(*SHAPE)
 PARTS = [Region(SHAPE, 4, 8, 16, 24), Region(SHAPE, 0, 16, 48, 32), Region(SHAPE, 8, 8, 0, 64)]
-CROPPABLE = [name for name, kind in BACKBONES.items() if kind.croppable]
+CROPPABLE = [name for name, kind in BACKBONES._entries.items() if kind.croppable]
 
 
 def backbone(name: str, rays: torch.Tensor = RAYS, **options) -> Backbone:

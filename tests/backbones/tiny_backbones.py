@@ -11,9 +11,9 @@ from r2flow.backbones.layers import ExactLinear
 from r2flow.lidar.sensors import build_sensor
 from tests.conftest import tiny_options
 
-NAMES = [*BACKBONES, "plain"]  # `Plain`, in the table by conftest
+NAMES = [*BACKBONES._entries, "plain"]  # `Plain`, in the table by conftest
 PUBLISHED = ["hdit", "adm_unet", "efficient_unet"]  # with position, ring and dropout
-TWO_TIMES = [name for name, kind in BACKBONES.items() if kind.takes_second_time]
+TWO_TIMES = [name for name, kind in BACKBONES._entries.items() if kind.takes_second_time]
 ROWS, COLUMNS = 16, 64
 
 

@@ -68,7 +68,7 @@ def loaded(*families: Family) -> Iterator[None]:
     )
     # Hydra's own stay
     choices = {group: copy.deepcopy(store.repo.get(group, {})) for group in REGISTRIES}
-    before, known = [dict(table.items()) for table in tables], dict(plugins._loaded)
+    before, known = [dict(table._entries) for table in tables], dict(plugins._loaded)
     plugins._loaded.clear()  # those of other tests in this process
     try:
         plugins.load_plugins([str(FAMILIES / f"{family.file}.py") for family in families])
