@@ -252,7 +252,6 @@ class PartialOptions:
         """
         from r2flow.lidar.sensors import named_sensor
         from r2flow.model.checkpoint import load_checkpoint
-        from r2flow.model.shipped import MODELS
 
         loaded = load_checkpoint(model, choose_device(device))
         if self.to or self.size:
@@ -260,7 +259,7 @@ class PartialOptions:
         return loaded.open_partial(
             what,
             self.source,
-            keep_beams=model in MODELS and not (self.to or self.size),
+            keep_beams=loaded.keeps_beams,
             scale=self.reflectance_scale,
             most=self.scans,
             columns=self.columns,
@@ -312,7 +311,8 @@ def complete(
     from r2flow.lidar.known import mask_identity, parse_mask
     from r2flow.model.completion import completing, usual_precision
     from r2flow.model.shipped import DEFAULT, DENSIFY
-    from r2flow.reports.answers import Job, lack_sectors, write_completed
+    from r2flow.reports.answer_rays import Job, lack_sectors
+    from r2flow.reports.answers import write_completed
 
     check_folder(out)
     mask = parse_mask(given.mask) if given.mask else None

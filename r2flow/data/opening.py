@@ -162,16 +162,24 @@ class Described:
         )
 
     @property
+    def written_scale(self) -> float | None:
+        """Full reflectance in files that r2flow wrote: 1, or of completed scans that of the scans;
+        None if these differ.
+        """
+        scales = set(self.manifest.get("reflectance_scales", {"": 1.0}).values())
+        return float(scales.pop()) if len(scales) == 1 else None
+
+    @property
     def is_samples(self) -> bool:
         """Whether they are samples or completed scans of a model, which are images of one size."""
         return self.manifest.get("format") in ("r2flow samples", "r2flow answers")
 
-    def scale(self, of_sensor: float | None) -> float:
+    def scale(self, of_sensor: float | None) -> float | None:
         """Default value of full reflectance in the files; `of_sensor`: that of the sensor, if
-        known.
+        known. None: that of each file is estimated.
         """
         if self.options.name == FOLDER:
-            return 1.0 if self.made_here else of_sensor or 1.0
+            return self.written_scale if self.made_here else of_sensor or 1.0
         return self.kind.reflectance_scale
 
     def part(self, **options: Any) -> "Described":
@@ -184,7 +192,7 @@ class Described:
         if options.name == FOLDER:
             self.refuse_other_samples(reading.sensor)
             if self.made_here:
-                reading = replace(reading, reflectance_scale=1.0)
+                reading = replace(reading, reflectance_scale=self.written_scale)
         if reading.reflectance == AUTO:
             reading = replace(
                 reading, reflectance=self.kind.lacks_reflectance(self, reading.on_bad_scan) is None
@@ -307,8 +315,8 @@ def open_scans(
         scans.refuse_other_samples(reading.sensor)
     elif not own_size:
         warn_of_other_sensor([scans.file], reading, scans.file, scans.made_here)
-    if scans.manifest:  # its reflectance is in [0, 1]
-        reading = replace(reading, reflectance_scale=1.0)
+    if scans.manifest:
+        reading = replace(reading, reflectance_scale=scans.written_scale)
     if own_size and image is not None:
         reading = replace(reading, sensor=reading.sensor.resized(*image.shape[1:]))
     if reading.reflectance == AUTO:

@@ -15,7 +15,7 @@ from r2flow.base.errors import InputError, naming, warn_odd
 from r2flow.data.opening import Described, describe, open_scans
 from r2flow.data.options import FOLDER, PREPARED, SIMULATED
 from r2flow.data.partial_images import FROM, is_image, read_partial
-from r2flow.data.reading import DIVIDED, Reading, nothing_in_view, scaled_reflectance
+from r2flow.data.reading import DIVIDED, Reading, nothing_in_view, reflectance_and_scale
 from r2flow.data.sources import LOOKED_AT, spread, warn_of_frame
 from r2flow.lidar.estimation import FULL_REFLECTANCE, SURE, full_reflectance, other_sensor
 from r2flow.lidar.known import Ray
@@ -31,7 +31,8 @@ from r2flow.lidar.other_sensors import (
 from r2flow.lidar.scan_files import (
     Points,
     points_beside,
-    read_points,
+    points_of,
+    read_cloud,
     scan_ending,
 )
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -56,6 +57,7 @@ class PartialScan:
     path: Path | None = None  # its file; None if it has no file
     image: bool = True  # whether it is a range image or points; completions have the same form
     whole: Sensor | None = None  # one that sees all its beams; None: the model's does
+    scale: float = 1.0  # value of full reflectance in its file
 
     def identity(self) -> str:
         """Hash of the content, which distinguishes scans of the same name."""
@@ -122,8 +124,10 @@ def _files(
     stored = described.stored
     folder = described.options.folder
     spec = described.label
+    named = source
     source = source or (stored.sensor if stored else None)
     whole = None
+    full = 1.0
     images = {path for path in paths if path.suffix.lower() == ".npy" and is_image(path)}
     read_image: Callable[[Path], Partial] = partial(
         read_partial, source=source, target=target, labels=reading.labels
@@ -131,9 +135,11 @@ def _files(
     by_points = read_image
     if points := [path for path in paths if path not in images]:
         chosen = [points[number] for number in spread(len(points), LOOKED_AT)]
-        scans = {path: read_points(path, reading.columns) for path in chosen}
-        see, lines, whole = sight(described, scans, reading, source, scale)
-        by_points = lambda path: see(path, read_points(path, reading.columns))  # noqa: E731
+        scans = {path: measured_points(path, reading.columns) for path in chosen}
+        again = any(scan.cloud.place("measured") is not None for scan in scans.values())
+        seen = sight(described, scans, reading, named if again else source, scale)
+        lines, whole, full = seen.lines, seen.whole, seen.scale or 1.0
+        by_points = lambda path: seen.see(path, measured_points(path, reading.columns))  # noqa: E731
     elif source and not source.same_image(target):
         lines += _described(spec, source, target)
         whole = seeing_all(source, target)
@@ -143,9 +149,29 @@ def _files(
         below = path.relative_to(folder) if path.is_relative_to(folder) else Path(path.name)
         name = str(below)[: len(str(below)) - len(ending)]
         read = partial(read_image if path in images else by_points, path)
-        return PartialScan(name, ending, read, path.read_bytes, path, path in images, whole)
+        content = path.read_bytes
+        return PartialScan(name, ending, read, content, path, path in images, whole, full)
 
     return [opened(path) for path in paths], lines
+
+
+def measured_points(path: Path, columns: Sequence[str] | None) -> Points:
+    """The points of a file that a sensor measured, with all their fields."""
+    cloud = read_cloud(path, columns)
+    measured = cloud.measured()
+    if len(measured) < len(cloud):
+        warn_odd(path, "points that a completion added are left out", len(cloud) - len(measured))
+    return points_of(path, measured)
+
+
+@dataclass(frozen=True)
+class Seeing:
+    """How scans of one sensor are seen as images of the model's."""
+
+    see: Sight
+    lines: list[str]  # about the sensor
+    whole: Sensor | None  # a view that keeps all its beams, if the model's does not
+    scale: float | None  # value of full reflectance in the scans; None: of each by itself
 
 
 def sight(
@@ -154,11 +180,12 @@ def sight(
     reading: Reading,
     source: Sensor | None,
     scale: float | None = None,
-) -> tuple[Sight, list[str], Sensor | None]:
-    """How scans of one sensor are seen as images of the model's, lines about the sensor, and a
-    view that keeps all its beams, if the model's does not.
+    each: bool = False,
+) -> Seeing:
+    """How scans of one sensor are seen as images of the model's.
 
-    It is found from a few scans, by path. For the others see `open_partial`.
+    It is found from a few scans, by path. For the others see `open_partial`. With `each`, the scale
+    of reflectance is found for every scan by itself (`own_scale`).
     """
     path = next(iter(read))
     scans = [*read.values()]
@@ -187,11 +214,15 @@ def sight(
         warn_odd(path, f"sensor {source.name} does not fit these scans: {doubt.seen}{fits}")
     of_sensor = known.reflectance_scale if known else None
     usual = described.scale(of_sensor) if described.options.name != FOLDER or of_sensor else 0.0
-    full = scale or (1.0 if stored else full_reflectance(scans, usual) or usual) or 1.0
-    strict = scale is not None or full in FULL_REFLECTANCE
+    written = described.written_scale if stored else None
+    full = scale or written or full_reflectance(scans, usual) or usual or 1.0
+    if each and not scale:
+        full = own_scale(scans[0], of_sensor)
+    strict = scale is not None or (full in FULL_REFLECTANCE and not each)
+    of_scan = partial(own_scale, usual=of_sensor) if each and not scale else lambda _: full
     as_own = same and fired.columns >= FEWER * target.columns
     fired_by = None if as_own else fired
-    see = partial(_seen, reading=reading, fired=fired_by, scale=full, strict=strict)
+    see = partial(_seen, reading=reading, fired=fired_by, scale=of_scan, strict=strict)
     lines = []
     whole = None
     if not as_own:
@@ -200,7 +231,16 @@ def sight(
         whole = seeing_all(source or fired, target)
     if not (scale or stored) and full != usual and (of_sensor or full not in SURE):
         warn_odd(path, DIVIDED % full)
-    return see, lines, whole
+    return Seeing(see, lines, whole, None if each and not scale else full)
+
+
+def own_scale(points: Points, usual: float | None = None) -> float:
+    """The value of full reflectance of a scan, from its own values alone, so that scans of a stream
+    have the same scale whatever came before: `full_reflectance`, but bytes are of 255, since a
+    later scan of the same sensor may exceed 100.
+    """
+    full = full_reflectance([points], usual) or 1.0
+    return 255.0 if full == 100 and full != usual else full
 
 
 def _images(
@@ -271,15 +311,21 @@ def _described(spec: str, source: Sensor, target: Sensor, turns: bool = False) -
 
 
 def _seen(
-    path: Path, points: Points, reading: Reading, fired: Sensor | None, scale: float, strict: bool
+    path: Path,
+    points: Points,
+    reading: Reading,
+    fired: Sensor | None,
+    scale: Callable[[Points], float],
+    strict: bool,
 ) -> Partial:
     """The image of points of the model's sensor or, with `fired`, of another sensor."""
     target = reading.sensor
     if fired is None and reading.projection == "unfolding":
         points = points.with_lost_rays()
     strength = None  # reflectance in [0, 1]; None if the file has none, or only 0
+    full = 1.0
     if points.reflectance is not None and points.reflectance.any():
-        strength = scaled_reflectance(path, points, scale, strict)
+        strength, full = reflectance_and_scale(path, points, scale(points), strict)
     with naming(path):
         if fired is None:
             seen = points_of_same(points, target, reading.projection, reading.convention, strength)
@@ -294,10 +340,19 @@ def _seen(
     r = np.linalg.norm(points.xyz, axis=1)
     inside = (r >= target.min_range) & (r <= target.max_range)
     outside = int(np.count_nonzero(r) - inside.sum())
+    assert seen.row is not None
+    assert seen.place is not None
+    numbers = np.arange(len(r)) if points.kept is None else points.kept
     kept = Points(
-        points.xyz[inside], None if strength is None else strength[inside], dropped=outside
+        points.xyz[inside],
+        None if strength is None else strength[inside],
+        dropped=outside,
+        kept=numbers[inside],
+        cloud=points.cloud,
     )
-    return replace(seen, points=kept)
+    new = np.cumsum(inside) - 1  # number of each point among the kept ones
+    place = np.where(seen.place < 0, -1, new[seen.place])
+    return replace(seen, points=kept, row=seen.row[inside], place=place, scale=full)
 
 
 def _with_classes(seen: Partial, xyz: np.ndarray, classes: np.ndarray) -> np.ndarray:

@@ -158,8 +158,15 @@ def estimated_scale(path: str | Path, scans: Iterable[Points]) -> float:
 def scaled_reflectance(
     path: str | Path, points: Points, scale: float | None, strict: bool = True
 ) -> np.ndarray:
-    """The reflectance of points, scaled to [0, 1]; None estimates the scale. Unless `strict`, all
-    beyond is clipped.
+    """The reflectance of points in [0, 1], by `reflectance_and_scale`."""
+    return reflectance_and_scale(path, points, scale, strict)[0]
+
+
+def reflectance_and_scale(
+    path: str | Path, points: Points, scale: float | None, strict: bool = True
+) -> tuple[np.ndarray, float]:
+    """The reflectance of points, scaled to [0, 1], and the scale; None estimates it. Unless
+    `strict`, all beyond is clipped.
     """
     if points.reflectance is None:
         raise _no_reflectance(path)
@@ -192,7 +199,7 @@ def scaled_reflectance(
         )
     if beyond:
         warn_odd(path, f"reflectance beyond {scale:g} is clipped", beyond)
-    return (stored / np.float32(scale)).clip(0, 1)
+    return (stored / np.float32(scale)).clip(0, 1), scale
 
 
 def read_image(path: Path, reading: Reading) -> np.ndarray:

@@ -87,7 +87,7 @@ def _complete(source: SourceOptions, usual: Data, sensor: Sensor) -> Described:
         **source.chosen,
     }
     if scans.made_here:
-        reading["reflectance_scale"] = 1.0
+        reading["reflectance_scale"] = scans.written_scale
     return scans.part(reading=ReadingOptions(**reading))
 
 

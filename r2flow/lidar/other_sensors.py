@@ -28,7 +28,7 @@ from r2flow.lidar.projection import (
 from r2flow.lidar.scan_files import Points
 from r2flow.lidar.scan_files.points import NEAREST
 from r2flow.lidar.sensors import Sensor
-from r2flow.lidar.unfolding import elevations_of
+from r2flow.lidar.unfolding import elevations_of, unfolded_rows
 
 # Degrees: a wider sector without any return counts as not measured, as of a cropped scan.
 BLIND = 5.0
@@ -44,6 +44,15 @@ class Partial:
     state: ndarray  # `Ray` of each ray, (H, W) uint8
     xyz: ndarray | None = None  # measured points of the returns in metres, (3, H, W) float32
     points: Points | None = None  # all points of the scan's file; the image has the nearest ones
+    row: ndarray | None = None  # row of the image of each point, -1 outside the view, (N,)
+    place: ndarray | None = None  # number of the point of each return, else -1, (H, W)
+    scale: float = 1.0  # value of full reflectance in the file
+
+
+def gaps_unknown(given: Partial) -> Partial:
+    """A partial scan whose rays without a return count as not measured."""
+    state = np.where(given.state == Ray.EMPTY, np.uint8(Ray.UNKNOWN), given.state)
+    return replace(given, state=state)
 
 
 def sensor_of(scans: list[Points], named: Sensor | None) -> Sensor:
@@ -99,7 +108,11 @@ def points_through(
     pixel = row[beam[chosen]] * target.columns + _columns(azimuth[chosen], target.columns)
     if reflectance is not None:
         reflectance = reflectance[chosen]
-    return _cast(target, xyz[chosen], pixel, empty, reflectance)
+    seen = _cast(target, xyz[chosen], pixel, empty, reflectance)
+    assert seen.place is not None
+    place = np.where(seen.place < 0, -1, chosen[seen.place])
+    rows = np.where(beam >= 0, row[beam], rows_of(elevation, target))
+    return replace(seen, row=rows, place=place)
 
 
 def image_through(image: ndarray, source: Sensor, target: Sensor) -> Partial:
@@ -149,7 +162,12 @@ def points_of_same(
     returned = xyz[:, :2].any(axis=1)
     unknown |= _blind(_azimuth(xyz[returned]), target.columns, target.columns)
     state[unknown & (image[0] == 0)] = Ray.UNKNOWN
-    return Partial(image, state, scatter(target, hit, xyz[chosen].T))
+    if projection == "unfolding":
+        row = unfolded_rows(xyz, target, convention, points.ring)
+    else:
+        row = rows_of(elevations_of(xyz), target)
+    measured = scatter(target, hit, xyz[chosen].T)
+    return Partial(image, state, measured, row=row, place=_places(target, hit, chosen))
 
 
 def image_of_same(image: ndarray, target: Sensor) -> Partial:
@@ -187,7 +205,17 @@ def _cast(
     rays[pixel[near]] = Ray.UNKNOWN
     rays[hit] = Ray.RETURN
     values = [r[chosen]] if reflectance is None else [r[chosen], reflectance[chosen]]
-    return Partial(scatter(target, hit, values), state, scatter(target, hit, xyz[chosen].T))
+    measured = scatter(target, hit, xyz[chosen].T)
+    return Partial(
+        scatter(target, hit, values), state, measured, place=_places(target, hit, chosen)
+    )
+
+
+def _places(target: Sensor, pixel: ndarray, chosen: ndarray) -> ndarray:
+    """The number of the point of each pixel, (H, W); -1 without one."""
+    place = np.full(target.shape, -1)
+    place.ravel()[pixel] = chosen
+    return place
 
 
 def _azimuth(xyz: ndarray) -> ndarray:

@@ -26,12 +26,14 @@ from r2flow.generators import Generator, TransferFlow, build_generator
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import Points, points_in_memory
 from r2flow.lidar.sensors import Sensor, named_sensor
+from r2flow.model.completer import Completer
 from r2flow.model.completion import complete
 from r2flow.model.parts import HYPER, NOTES, PREFIX, config_of
 from r2flow.model.paths import find_checkpoint, title_of
 from r2flow.model.published import FORMATS
 from r2flow.model.sampling import sample
 from r2flow.model.saving import save_checkpoint
+from r2flow.model.shipped import name_of
 from r2flow.model.tensor_files import is_dense, read_checkpoint, read_safetensors
 from r2flow.samplers import build_sampler
 
@@ -55,6 +57,7 @@ class Checkpoint:
     step: int = 0
     path: Path = Path("unsaved")
     format: str = "r2flow"
+    chosen: bool = False  # whether its sensor was chosen by `through`, not by the training
     # By sensor: number of points, model and sight of the last scan that was new.
     _sights: dict[Any, Any] = field(default_factory=dict, init=False, compare=False)
 
@@ -181,15 +184,65 @@ class Checkpoint:
         number = len(points.xyz)
         known, *kept = self._sights.get(sensor, (0, self, None))
         if sensor is None or not 0.75 < known / number < 4 / 3:
-            source = None if sensor is None else named_sensor(sensor)
-            described = Described(IN_MEMORY, SourceOptions(PLAIN, IN_MEMORY))
-            reading = reading_for([], self)
-            see, remarks, _ = sight(described, {Path(IN_MEMORY): points}, reading, source)
-            for lost in remarks[1:]:
-                warnings.warn(lost.removeprefix(f"{IN_MEMORY}: "), stacklevel=3)
-            kept = [self._without_rows() if remarks else self, see]
+            kept = [*self._seeing(points, sensor, keep_beams=False)]
             self._sights[sensor] = (number, *kept)
         return tuple(kept)
+
+    def _seeing(
+        self,
+        points: Points,
+        sensor: Sensor | str | None,
+        keep_beams: bool,
+        scale: float | None = None,
+    ) -> "tuple[Checkpoint, Sight]":
+        """This model for the sensor of points in memory, with `keep_beams` in the view that keeps
+        all its beams, and how clouds of it are seen.
+        """
+        source = None if sensor is None else named_sensor(sensor)
+        described = Described(IN_MEMORY, SourceOptions(PLAIN, IN_MEMORY))
+        reading = reading_for([], self, labels=False)
+        found = sight(described, {Path(IN_MEMORY): points}, reading, source, scale, each=True)
+        if keep_beams and found.whole:
+            return self.through(found.whole)._seeing(points, sensor, False, scale)
+        for lost in found.lines[1:]:
+            warnings.warn(lost.removeprefix(f"{IN_MEMORY}: "), stacklevel=4)
+        return self._without_rows() if found.lines else self, found.see
+
+    @property
+    def keeps_beams(self) -> bool:
+        """Whether scans whose beams look past its sensor are completed in their own view: a model
+        by name, unless `through` chose its sensor.
+        """
+        return name_of(self.path) is not None and not self.chosen
+
+    def completer(
+        self,
+        sensor: Sensor | str | None = None,
+        *,
+        reflectance_scale: float | None = None,
+        columns: Sequence[str] | None = None,
+        fill_gaps: bool = False,
+        **how: Any,
+    ) -> Completer:
+        """Completes clouds of one sensor, one after another, with all their fields (`Completer`).
+
+        The view is that of the command line: the clouds' own, if it sees more than the model's, or
+        the one chosen by `through`.
+
+        Args:
+            sensor: Sensor of the clouds, by name or YAML file; None: found by the beams of the
+                first one.
+            reflectance_scale: Value of full reflectance; None: found for each cloud from its values
+                alone (`r2flow.data.partial.own_scale`).
+            columns: Fields to rename, as `intensities=reflectance`; names of the columns of rows.
+            fill_gaps: Treat rays without a return as unmeasured, as in a thinned scan.
+            how: Options of `r2flow.model.completion.complete`: sampler, precision, ...
+        """
+
+        def decide(points: Points) -> "tuple[Checkpoint, Sight]":
+            return self._seeing(points, sensor, self.keeps_beams, reflectance_scale)
+
+        return Completer(decide, columns, fill_gaps, how)
 
     def _without_rows(self) -> "Checkpoint":
         """This model for another sensor, whose beams fill other rows."""
@@ -218,6 +271,7 @@ class Checkpoint:
             generator=self.generator.at(
                 self.generator.space.through(named_sensor(sensor)), numbered
             ),
+            chosen=True,
         )
 
     def points(self, images: Tensor) -> list[np.ndarray]:

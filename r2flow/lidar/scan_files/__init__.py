@@ -1,27 +1,29 @@
 """Scan files: KITTI .bin, nuScenes .pcd.bin, PCD, PLY, NPY, tables, LAS, published samples and
 PandaSet.
 
-All are read; .bin, PCD, PLY and NPY are written.
+All are read, as `Cloud` with every field or as `Points`; all but the last two are written.
 
 points = read_points("000000.bin")
 write_points("000000.ply", points.xyz, points.reflectance)
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from numpy import ndarray
 
-from r2flow.base.errors import IN_MEMORY, InputError, naming, warn_odd
-from r2flow.base.files import atomic_write, reading
+from r2flow.base.errors import IN_MEMORY, InputError, check, naming, warn_odd
+from r2flow.base.files import atomic_write, reading, reading_errors
 from r2flow.lidar.scan_files import clouds, pandaset, samples, tables
+from r2flow.lidar.scan_files.cloud import Cloud
 from r2flow.lidar.scan_files.points import (
     FARTHEST,
     Points,
     check_columns,
-    column_points,
-    renamed,
     warn_of_unused,
 )
 from r2flow.lidar.scan_files.points import NoPointsError as NoPointsError
@@ -43,14 +45,27 @@ ELSEWHERE = {
         "save scan.csv, a file a scan; Velodyne: VeloView, Save As CSV; Hesai, RoboSense: their "
         "ROS driver and r2flow unpack)"
     ),
-    (".laz", ".e57", ".pts", ".ptx", ".rcp", ".fls"): "is read by CloudCompare, which saves .ply",
+    (".e57", ".pts", ".ptx", ".rcp", ".fls"): "is read by CloudCompare, which saves .ply",
     (".npz", ".h5", ".hdf5", ".zarr", ".mat", ".tfrecord"): (
         "holds arrays: write x, y, z, intensity of each scan by numpy.save"
     ),
     (".lvx", ".lvx2", ".lvx3"): "is of a Livox, which has no beams; r2flow needs a spinning LiDAR",
     (".gz", ".bz2", ".xz", ".zst", ".zstd", ".zip", ".tar"): "is compressed: unpack it",
 }
-WRITTEN = (".bin", ".pcd", ".ply", ".npy")
+PLAIN = (".bin", ".pcd", ".ply", ".npy")  # that `write_points` writes
+_WRITERS: dict[str, Callable[[IO[bytes], Cloud], None]] = {
+    ".pcd.bin": tables.write_rows,
+    ".bin": tables.write_rows,
+    ".pcd": clouds.write_pcd,
+    ".ply": clouds.write_ply,
+    ".npy": tables.write_npy,
+    **dict.fromkeys((".csv", ".xyz", ".txt"), tables.write_text),
+    ".feather": partial(tables.write_arrow, ending=".feather"),
+    ".parquet": partial(tables.write_arrow, ending=".parquet"),
+    ".las": partial(tables.write_las, compressed=False),
+    ".laz": partial(tables.write_las, compressed=True),
+}
+WRITTEN = tuple(_WRITERS)
 SCAN_ENDINGS = (*_ROWS, *_READERS)
 LOOSE_ENDINGS = (".csv", ".txt", ".pth")  # also used for other files than scans
 FIRM_ENDINGS = tuple(
@@ -86,6 +101,11 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
         InputError: The file is missing, of an unknown format, damaged, without a finite point, or
             holds values that no LiDAR measures. The message names the file.
     """
+    return replace(points_of(Path(path), read_cloud(path, columns)), cloud=None)
+
+
+def read_cloud(path: str | Path, columns: Sequence[str] | None = None) -> Cloud:
+    """All fields of a scan file, as stored; `columns` and errors as of `read_points`."""
     path = Path(path)
     check_columns(columns)
     ending = scan_ending(path.name)
@@ -96,34 +116,47 @@ def read_points(path: str | Path, columns: Sequence[str] | None = None) -> Point
     raw = ending in _ROWS
     with reading(path, LARGEST_FILE, "scan file", least=0 if raw else 1):
         if raw:
-            stored = None
-            arrays = tables.read_rows(path, columns)
-            if columns is None and ending == ".pcd.bin":
-                columns = ("x", "y", "z", "intensity", "ring")
-        else:
-            stored, arrays = _READERS[ending](path)
-        if stored:
-            names = renamed(stored, columns)
-        else:
-            names = list(tables.usual_names(len(arrays), columns))
-        points = column_points(names, arrays, raw)
-        if stored:
-            warn_of_unused(path, names, arrays, points)
-    return _tell_dropped(path, points)
+            return _with_beside(path, tables.read_rows(path, columns))
+        cloud = _READERS[ending](path)
+        if cloud.names is not None:
+            return cloud.renamed(columns)
+        width = len(cloud.columns)
+        names = tuple(tables.usual_names(width, columns))
+        return _with_beside(path, replace(cloud, aliases=names, held=width))
 
 
-def points_in_memory(rows: ndarray) -> Points:
-    """The points of an array (N, 3 or 4): x, y, z and reflectance, as `read_points` of a file."""
-    with naming(IN_MEMORY):
-        points = column_points(tables.usual_names(rows.shape[1], None), [*rows.T])
-    return _tell_dropped(Path(IN_MEMORY), points)
+def beside(path: Path) -> Path:
+    """The file of the fields that the rows of a scan file without names cannot hold."""
+    return path.with_name(path.name.removesuffix(scan_ending(path.name)) + ".fields.npz")
 
 
-def _tell_dropped(path: Path, points: Points) -> Points:
+def _with_beside(path: Path, cloud: Cloud) -> Cloud:
+    """The cloud with the fields in the file beside it, if there is one."""
+    if not beside(path).is_file():
+        return cloud
+    with np.load(beside(path)) as stored:
+        fields = {name: stored[name] for name in stored.files}
+    if any(column.shape[:1] != (len(cloud),) for column in fields.values()):
+        raise InputError(f"{beside(path)} is not of its {len(cloud)} points: move it elsewhere.")
+    return cloud.with_fields(fields)
+
+
+def points_of(path: Path, cloud: Cloud) -> Points:
+    """The points of a cloud, with it; errors and warnings name the path."""
+    ending = scan_ending(path.name)
+    with reading_errors(path):
+        points = cloud.points(raw=ending in _ROWS)
+        if cloud.names is not None:
+            warn_of_unused(path, cloud.aliases or cloud.names, cloud.columns, points)
     if points.dropped:
         kind = f"points that are NaN, infinite or beyond {FARTHEST:g} m are dropped"
         warn_odd(path, kind, points.dropped)
     return points
+
+
+def points_in_memory(rows: ndarray) -> Points:
+    """The points of an array (N, 3 or 4): x, y, z and reflectance, as `read_points` of a file."""
+    return points_of(Path(IN_MEMORY), Cloud.of(rows))
 
 
 def conversion_of(path: str | Path) -> str | None:
@@ -204,9 +237,9 @@ def write_points(
     """
     path = Path(path)
     ending = path.suffix.lower()
-    writable = ending in WRITTEN and scan_ending(path.name) == ending
+    writable = ending in PLAIN and scan_ending(path.name) == ending
     if not writable or (ending == ".bin" and reflectance is None):
-        formats = ", ".join(WRITTEN)
+        formats = ", ".join(PLAIN)
         raise InputError(f"{path}: scans are written as {formats}; .bin only with a reflectance.")
     columns = dict(zip("xyz", xyz.T, strict=True))
     if reflectance is not None:
@@ -216,13 +249,32 @@ def write_points(
     with np.errstate(over="ignore"):  # float32 overflow is infinite
         table = np.column_stack([*columns.values()]).astype("<f4")
     assert np.isfinite(table).all(), "a coordinate or reflectance is NaN or infinite"
-    with atomic_write(path) as file:
-        if ending == ".npy":
-            np.save(file, table)
-        elif ending == ".bin":
-            file.write(table.tobytes())
-        else:
-            clouds.WRITERS[ending](file, table, tuple(columns))
+    names = tuple(columns)
+    named = ending in (".pcd", ".ply")
+    write_cloud(path, Cloud(names if named else None, tuple(table.T), names, held=len(names)))
+
+
+def write_cloud(path: Path, cloud: Cloud) -> None:
+    """Write all fields of a cloud with their types, atomically; the ending is the format.
+
+    PCD and PLY are binary and little-endian. Rows without names (.bin, .npy, text) hold what they
+    held when they were read; other fields go into the file `beside` them.
+
+    Raises:
+        InputError: A field has a type or a name that the format cannot hold, or two have one name.
+    """
+    ending = scan_ending(path.name)
+    with naming(path):
+        check(ending in WRITTEN, f"scans are written as {', '.join(WRITTEN)}.")
+        rows = cloud.array() if cloud.names is None else None
+        if rows is not None and ending in (".pcd", ".ply"):  # these name their fields
+            cloud = replace(Cloud.of(rows), header=cloud.header)
+        with atomic_write(path) as file:
+            _WRITERS[ending](file, cloud)
+        others = () if cloud.names or rows is None else (rows.dtype.names or ())[cloud.held :]
+        if rows is not None and others:
+            with atomic_write(beside(path)) as file:
+                np.savez_compressed(file, **{name: rows[name] for name in others})
 
 
 def scan_ending(name: str) -> str:

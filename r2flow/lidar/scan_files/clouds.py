@@ -8,7 +8,6 @@ PCDs need the package lzf.
 import math
 import re
 import struct
-from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
@@ -16,6 +15,7 @@ import numpy as np
 from numpy import ndarray
 
 from r2flow.base.errors import InputError, require
+from r2flow.lidar.scan_files.cloud import Cloud
 
 PLY_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 PLY_CODES = {  # NumPy's codes of PLY's types
@@ -23,10 +23,13 @@ PLY_CODES = {  # NumPy's codes of PLY's types
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I",
     "float": "f", "double": "d", "float32": "f", "float64": "d",
 }  # fmt: skip
+PLY_TYPES = {  # by NumPy's
+    "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint",
+    "f4": "float", "f8": "double",
+}  # fmt: skip
+PCD_SIZES = "integers of 1, 2, 4, 8 bytes and floats of 4, 8"
 
-Table = tuple[list[str] | None, list[ndarray]]  # names of the columns, or None; columns
-
-
+PADDING = "_"  # PCL's name of bytes without meaning
 PICKLED = b"\x80"  # of protocol 2 and later
 UNPACK = (  # joblib's list of (N, 3) arrays, of which each becomes a file
     "python -c \"import joblib, numpy; [numpy.save(f'{i:06}.npy', x) for i, x in "
@@ -34,7 +37,7 @@ UNPACK = (  # joblib's list of (N, 3) arrays, of which each becomes a file
 )
 
 
-def read_pcd(path: Path) -> Table:
+def read_pcd(path: Path) -> Cloud:
     """All fields of a PCD of version 0.7, or older ones, whose fields may be called COLUMNS.
 
     VIEWPOINT is not applied: points are in the sensor's frame. A field of COUNT 0 stores nothing.
@@ -59,8 +62,20 @@ def read_pcd(path: Path) -> Table:
     sizes = header.get("POINTS") or header["WIDTH"] + header["HEIGHT"]
     count = math.prod(map(int, sizes))
     encoding = header["DATA"][0]
+    width, height = [*map(int, header.get("WIDTH", "0") + header.get("HEIGHT", "0")), 0][:2]
+    grid = (height, width) if height > 1 and height * width == count else None
+
+    def cloud(columns: list[ndarray]) -> Cloud:
+        kept = [place for place, name in enumerate(names) if name != PADDING]
+        return Cloud(
+            tuple(names[place] for place in kept),
+            tuple(columns[place] for place in kept),
+            shape=grid,
+            header=header.get("VIEWPOINT"),
+        )
+
     if encoding != "binary_compressed":
-        return names, _columns(body, row, count, encoding)
+        return cloud(_columns(body, row, count, encoding))
     require(str(path), "formats", "lzf")
     from lzf import decompress
 
@@ -69,21 +84,30 @@ def read_pcd(path: Path) -> Table:
         raise InputError("its header declares another size than its data. Is it damaged?")
     blocks = decompress(body[8 : 8 + stored], size)  # all x, then all y, ...
     fields = (row.fields or {}).values()
-    return names, [np.frombuffer(blocks, kind, count, count * at) for kind, at, *_ in fields]
+    return cloud([np.frombuffer(blocks, kind, count, count * at) for kind, at, *_ in fields])
 
 
-def write_pcd(file: IO[bytes], table: ndarray, names: Sequence[str]) -> None:
-    """Write fields as binary float32."""
-    count, width = table.shape
-    ones, fours, floats = (" ".join(mark * width) for mark in "14F")
+def write_pcd(file: IO[bytes], cloud: Cloud) -> None:
+    """Write all fields as binary, little-endian."""
+    rows = _little(cloud.array())
+    fields = [row.subdtype or (row, ()) for row, *_ in (rows.dtype.fields or {}).values()]
+    names = rows.dtype.names or ()
+    kinds = [kind for kind, _ in fields]
+    for name, kind in zip(names, kinds, strict=True):
+        _check_type(name, kind, "PCD", kind.kind in "iuf" and kind.itemsize <= 8, PCD_SIZES)
+    viewpoint = " ".join(cloud.header or ["0", "0", "0", "1", "0", "0", "0"])
     file.write(
-        f"VERSION 0.7\nFIELDS {' '.join(names)}\nSIZE {fours}\nTYPE {floats}\nCOUNT {ones}\n"
-        f"WIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA binary\n".encode()
+        f"VERSION 0.7\nFIELDS {' '.join(names)}\n"
+        f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}\n"
+        f"TYPE {' '.join(kind.kind.upper() for kind in kinds)}\n"
+        f"COUNT {' '.join(str(math.prod(shape)) for _, shape in fields)}\n"
+        f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT {viewpoint}\nPOINTS {len(rows)}\n"
+        "DATA binary\n".encode()
     )
-    file.write(table.tobytes())
+    file.write(rows.tobytes())
 
 
-def read_ply(path: Path) -> Table:
+def read_ply(path: Path) -> Cloud:
     """All properties of the element `vertex`, the first; later ones, as of a mesh, are ignored."""
     text, body = _split_header(path.read_bytes())
     head, vertex, *others = text.split("\nelement ")
@@ -94,22 +118,44 @@ def read_ply(path: Path) -> Table:
     name, count = vertex.split()[:2]
     if name != "vertex":
         raise InputError("its first element is not 'vertex', the points.")
-    names = [name.strip() for _, name in properties]
-    return names, _columns(body, row, int(count), encoding, last=not others)
+    names = tuple(name.strip() for _, name in properties)
+    return Cloud(names, tuple(_columns(body, row, int(count), encoding, last=not others)))
 
 
-def write_ply(file: IO[bytes], table: ndarray, names: Sequence[str]) -> None:
-    """Write vertices as little-endian float32."""
-    properties = "".join(f"property float {name}\n" for name in names)
+def write_ply(file: IO[bytes], cloud: Cloud) -> None:
+    """Write all fields of the vertices, little-endian."""
+    rows = _little(cloud.array())
+    properties = []
+    for name, (kind, *_) in (rows.dtype.fields or {}).items():
+        held = PLY_TYPES.get(kind.str[1:])
+        _check_type(name, kind, "PLY", held, "integers of 1, 2, 4 bytes and floats of 4, 8")
+        properties.append(f"property {held} {name}\n")
     file.write(
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(table)}\n"
-        f"{properties}end_header\n".encode()
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n"
+        f"{''.join(properties)}end_header\n".encode()
     )
-    file.write(table.tobytes())
+    file.write(rows.tobytes())
+
+
+def _little(rows: ndarray) -> ndarray:
+    """Rows in little-endian order, of equal values; booleans as bytes."""
+    kinds = [
+        (name, kind.base.newbyteorder("<") if kind.base.kind != "b" else "u1", kind.shape)
+        for name, (kind, *_) in (rows.dtype.fields or {}).items()
+    ]
+    return rows.astype(kinds)
+
+
+def _check_type(name: str, kind: np.dtype, form: str, held: object, holds: str) -> None:
+    if not held:
+        raise InputError(
+            f"the field {name} is {kind}, which a {form} cannot hold ({holds}): convert it."
+        )
+    if not name.strip() or len(name.split()) > 1:
+        raise InputError(f"the field {name!r} has a name that a {form} cannot hold: rename it.")
 
 
 READERS = {".pcd": read_pcd, ".ply": read_ply}
-WRITERS = {".pcd": write_pcd, ".ply": write_ply}
 
 
 def _split_header(data: bytes) -> tuple[str, bytes]:

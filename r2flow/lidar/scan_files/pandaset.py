@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from r2flow.base.errors import InputError, check
 from r2flow.base.files import read_json
-from r2flow.lidar.scan_files.clouds import Table
+from r2flow.lidar.scan_files.cloud import Cloud
 from r2flow.lidar.scan_files.pickled import column, read_table
 from r2flow.lidar.sensors import SENSORS
 
@@ -38,14 +38,15 @@ CLASSES = np.array([
 ], np.uint16)  # fmt: skip
 
 
-def read_frame(path: Path) -> Table:
-    """x, y, z and intensity (0 to 255) of the points of the Pandar64 (`d == 0`)."""
+def read_frame(path: Path) -> Cloud:
+    """x, y, z, intensity (0 to 255) and time (s) of the points of the Pandar64 (`d == 0`)."""
     table = read_table(path)
     spinning = column(table, "d") == 0
     world = np.stack([column(table, axis)[spinning] for axis in "xyz"], axis=1)
     times = column(table, "t")[spinning].astype(float)
     strength = column(table, "i")[spinning]
-    return ["x", "y", "z", "i"], [*in_laser(world.astype(float), times, path.parent).T, strength]
+    xyz = in_laser(world.astype(float), times, path.parent)
+    return Cloud(("x", "y", "z", "i", "t"), (*xyz.T, strength, times))
 
 
 def in_laser(world: ndarray, times: ndarray, folder: Path) -> ndarray:

@@ -4,11 +4,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy import ndarray
 
 from r2flow.base.errors import InputError, warn_odd
+
+if TYPE_CHECKING:
+    from r2flow.lidar.scan_files.cloud import Cloud
 
 # No LiDAR measures 10 km or less than a millimetre. Nearly all floats read in the wrong byte order
 # or width are beyond these limits, because their exponent changes.
@@ -22,7 +26,13 @@ ROLES: Mapping[str, tuple[str, ...]] = {
     "reflectance": ("intensity", "reflectance", "reflectivity", "remission", "i"),
     # Argoverse's, VeloView's and Autoware's
     "ring": ("ring", "laser_number", "laser_id", "channel"),
-}
+    "time": (
+        "t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset",
+        "offset_ns", "gps_time", "point_time_offset",
+    ),
+    "measured": ("measured",),  # r2flow's: 0 for a point that a completion added
+}  # fmt: skip
+_ONCE = ("x", "y", "z", "reflectance", "ring")  # a file's columns name each at most once
 _ROLE_OF = {alias: role for role, aliases in ROLES.items() for alias in aliases}
 
 
@@ -39,6 +49,7 @@ class Points:
     ring: ndarray | None = None  # number of the beam, (N,), uint16; None if the file has none
     dropped: int = 0  # dropped rows: a value was NaN or infinite, or beyond `FARTHEST`
     kept: ndarray | None = None  # index in the file of each remaining row, (N,); None: all
+    cloud: "Cloud | None" = None  # all fields and rows, where a completion needs them
 
     def __post_init__(self) -> None:
         check_xyz(self.xyz)
@@ -55,10 +66,10 @@ class Points:
         xyz = np.zeros((rows, 3), np.float32)
         xyz[self.kept] = self.xyz
         if self.reflectance is None:
-            return Points(xyz)
+            return Points(xyz, cloud=self.cloud)
         reflectance = np.zeros(rows, np.float32)
         reflectance[self.kept] = self.reflectance
-        return Points(xyz, reflectance)
+        return Points(xyz, reflectance, cloud=self.cloud)
 
 
 def check_xyz(xyz: ndarray) -> None:
@@ -73,6 +84,12 @@ def role_of(name: str) -> str | None:
     Names are compared without case and without CloudCompare's prefix `scalar_`.
     """
     return _ROLE_OF.get(_plain(name))
+
+
+def places_of(names: Sequence[str], role: str) -> list[int]:
+    """The numbers of the fields of a role, a key of `ROLES`, in the order of its names there."""
+    plain = [_plain(name) for name in names]
+    return [plain.index(alias) for alias in ROLES[role] if alias in plain]
 
 
 def _plain(name: str) -> str:
@@ -91,11 +108,11 @@ def check_columns(columns: Sequence[str] | None) -> None:
         pairs = [name.rpartition("=") for name in names]
         if any(not field or (role != "_" and not role_of(role)) for field, _, role in pairs):
             raise InputError(
-                "columns rename fields to x, y, z, reflectance, ring or, if unused, _, as "
+                "columns rename fields to x, y, z, reflectance, ring, time or, if unused, _, as "
                 f"intensities=reflectance,channel=_; found {','.join(names)[:80]}."
             )
         return
-    roles = [role for role in map(role_of, names) if role]
+    roles = [role for role in map(role_of, names) if role in _ONCE]
     if len(set(roles)) < len(roles) or not set("xyz").issubset(roles):
         raise InputError(
             "columns must name x, y and z, and intensity and ring at most once, as "
@@ -141,11 +158,7 @@ def column_points(names: Sequence[str], columns: Sequence[ndarray], raw: bool = 
         NoPointsError: There are no points, or only rays without return.
         InputError: The columns hold no numbers, or numbers that are no scan.
     """
-    plain = [_plain(name) for name in names]
-    roles = {
-        role: [columns[plain.index(alias)] for alias in aliases if alias in plain]
-        for role, aliases in ROLES.items()
-    }
+    roles = {role: [columns[place] for place in places_of(names, role)] for role in _ONCE}
     _refuse_missing([role for role in "xyz" if not roles[role]], names)
     for column in chain(*roles.values()):
         if column.ndim != 1 or column.dtype.kind not in "fiub":
@@ -156,9 +169,7 @@ def column_points(names: Sequence[str], columns: Sequence[ndarray], raw: bool = 
         size = abs(axes).max(axis=0)
         finite = np.isfinite(size)
         if roles["reflectance"]:
-            measured = [column for column in roles["reflectance"] if column.any()]
-            stored = measured or roles["reflectance"]  # an intensity of only 0 was not measured
-            reflectance = np.array(stored[0], dtype=np.float32)
+            reflectance = np.array(first_filled(roles["reflectance"]), dtype=np.float32)
             finite &= np.isfinite(reflectance)
     _check_values(size, reflectance, finite, raw)
     kept = np.flatnonzero(finite & (size <= FARTHEST))
@@ -170,6 +181,13 @@ def column_points(names: Sequence[str], columns: Sequence[ndarray], raw: bool = 
         dropped,
         kept if dropped else None,
     )
+
+
+def first_filled(columns: Sequence[ndarray]) -> ndarray:
+    """The first of some columns that is not 0 throughout, as what was not measured is; else the
+    first.
+    """
+    return next((column for column in columns if column.any()), columns[0])
 
 
 def _check_values(size: ndarray, reflectance: ndarray | None, finite: ndarray, raw: bool) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy import ndarray
 
 from r2flow.base.errors import InputError
-from r2flow.lidar.scan_files.clouds import Table
+from r2flow.lidar.scan_files.cloud import Cloud
 
 _CHANNELS = {"depth": (1,), "xyz": (3,), "reflectance": (0, 1)}
 
@@ -56,11 +56,12 @@ def read_image(path: Path) -> ndarray:
     return np.concatenate([sample["depth"], sample["reflectance"]])
 
 
-def read_points(path: Path) -> Table:
+def read_points(path: Path) -> Cloud:
     """The points of all pixels; those of rays without return are (0, 0, 0)."""
     sample = _read(path)
     columns = [*sample["xyz"], *sample["reflectance"]]
-    return ["x", "y", "z", "reflectance"][: len(columns)], [column.ravel() for column in columns]
+    names = ("x", "y", "z", "reflectance")[: len(columns)]
+    return Cloud(names, tuple(column.ravel() for column in columns))
 
 
 READERS = {".pth": read_points}

@@ -3,22 +3,35 @@
 import io
 import re
 from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from numpy import ndarray
 
 from r2flow.base.errors import InputError, require
-from r2flow.lidar.scan_files.clouds import Table
+from r2flow.lidar.scan_files.cloud import Cloud
 from r2flow.lidar.scan_files.points import is_renaming, role_of
 from r2flow.lidar.scan_files.widths import fits_width, fitting_widths
 
+
+@dataclass(frozen=True)
+class TextForm:
+    """How the lines of a text file are written."""
+
+    separator: str
+    prefix: str  # before the names, as of a comment
+
+
 _NUMBER = re.compile(r"(^|[;,\s])[-+]?(\.?\d|nan\b|inf\b)", re.IGNORECASE)
+LARGEST = 1 << 30  # bytes of the points of a compressed file
 WIDEST = 32  # columns of points; a wider array is an image
 _UNIT = re.compile(r"\s*[\[(](?!([cmk]m|ft)\b).*")  # other units than metres stay: not a known name
 
 
-def read_rows(path: Path, columns: Sequence[str] | None) -> list[ndarray]:
+def read_rows(path: Path, columns: Sequence[str] | None) -> Cloud:
     """Rows of little-endian float32: as many as `columns`, or nuScenes' 5 or KITTI's 4.
 
     Raises:
@@ -45,7 +58,9 @@ def read_rows(path: Path, columns: Sequence[str] | None) -> list[ndarray]:
             f"it is not made of rows of {width} float32: {left} bytes are left. Is it cut short, "
             "or of other columns (--columns x,y,z,intensity,ring)?"
         )
-    return list(values.reshape(-1, width).T)
+    named = columns or (("x", "y", "z", "intensity", "ring") if width == 5 else None)
+    names = tuple(usual_names(width, named))
+    return Cloud(None, tuple(values.reshape(-1, width).T), names, held=width)
 
 
 def read_array(path: Path) -> ndarray:
@@ -57,21 +72,21 @@ def read_array(path: Path) -> ndarray:
     return np.array(mapped)
 
 
-def read_npy(path: Path) -> Table:
+def read_npy(path: Path) -> Cloud:
     """An array (N, 3) or wider, or with named fields."""
     array = read_array(path)
     if array.dtype.names is not None:
-        return list(array.dtype.names), [array[name] for name in array.dtype.names]
+        return Cloud.of(array)
     if array.ndim != 2 or array.shape[1] > WIDEST:
         raise InputError(
             f"it holds an array {array.dtype} {array.shape}, not points: these are (N, 3) or "
             "(N, 4). Range images are floats (2, H, W), range in metres and reflectance, or "
             "(1, H, W)."
         )
-    return None, list(array.T)
+    return Cloud(None, tuple(array.T))
 
 
-def read_text(path: Path) -> Table:
+def read_text(path: Path) -> Cloud:
     """A point per line, separated by commas, semicolons, tabs or spaces.
 
     Names stand in the first line, or in the comment before it.
@@ -89,7 +104,8 @@ def read_text(path: Path) -> Table:
         raise InputError("it holds no line of numbers.")
     separator = next((mark for mark in ";\t," if mark in rows[-1]), None)
     words = head.lstrip("#/ ").split(separator)  # CloudCompare writes names after //, NumPy after #
-    names = [_UNIT.sub("", word.strip()) for word in words]
+    stored = tuple(word.strip() for word in words)
+    names = [_UNIT.sub("", word) for word in stored]
     if "X1" in names:  # by ouster-cli
         names = ["ring" if name == "ROW" else name for name in names]
     try:
@@ -100,14 +116,26 @@ def read_text(path: Path) -> Table:
         # Slower; empty values, as of rays without return, and words become NaN.
         table = np.genfromtxt(rows, delimiter=separator, comments=None, ndmin=2)  # type: ignore[call-overload]
     width = table.shape[1]
+    form = TextForm(separator or " ", head[: len(head) - len(head.lstrip("#/ "))])
     if in_comment and (len(words) != width or not any(map(role_of, names))):
-        return None, list(table.T)
+        return Cloud(None, tuple(table.T), header=form)
     if len(words) < width and not np.isnan(table[:, -1]).all():
         raise InputError("rows are longer than the names.")
-    return names, list(table.T)
+    return Cloud(stored[:width], _exact(table, rows, separator), tuple(names[:width]), header=form)
 
 
-def read_arrow(path: Path) -> Table:
+def _exact(table: ndarray, rows: Sequence[str], separator: str | None) -> tuple[ndarray, ...]:
+    """The columns of a text; integers that float64 would round, as nanoseconds, are read again."""
+    columns = [*table.T]
+    for place, column in enumerate(columns):
+        if abs(column[0]) >= 2**53 and (rows[0].split(separator)[place].strip(" +-")).isdigit():
+            columns[place] = np.loadtxt(
+                rows, np.int64, delimiter=separator, comments=None, usecols=place, ndmin=1
+            )
+    return tuple(columns)
+
+
+def read_arrow(path: Path) -> Cloud:
     """A Feather or Parquet table: Argoverse 2's lidar."""
     require(str(path), "formats", "pyarrow")
     from pyarrow import dataset
@@ -119,12 +147,14 @@ def read_arrow(path: Path) -> Table:
         raise InputError(f"it declares {rows:,} rows, far more than its size. Is it damaged?")
     table = stored.to_table()
     table.validate(full=True)
-    return table.column_names, [column.to_numpy() for column in table.columns]
+    columns = tuple(column.to_numpy() for column in table.columns)
+    return Cloud(tuple(table.column_names), columns, header=stored.schema)
 
 
-def read_las(path: Path) -> Table:
-    """LAS, read with laspy: scaled x, y, z, intensity if measured, and extra fields."""
-    require(str(path), "formats", "laspy")
+def read_las(path: Path) -> Cloud:
+    """LAS and LAZ, read with laspy: scaled x, y, z, and all other fields."""
+    compressed = path.suffix.lower() == ".laz"
+    require(str(path), "formats", "laspy", *(["lazrs"] if compressed else []))
     import laspy
 
     content = path.read_bytes()
@@ -134,17 +164,20 @@ def read_las(path: Path) -> Table:
         records += 60 * int.from_bytes(content[243:247], "little")
     if records > len(content):
         raise InputError("its header is damaged.")
-    with laspy.open(io.BytesIO(content), laz_backend=(), read_evlrs=False) as reader:
+    backend = laspy.LazBackend.Lazrs if compressed else ()
+    with laspy.open(io.BytesIO(content), laz_backend=backend, read_evlrs=False) as reader:
         header = reader.header
-        if header.point_count * header.point_format.size > len(content):
+        most = LARGEST if compressed else len(content)
+        if header.point_count * header.point_format.size > most:
             raise InputError(
                 f"it is too small for the {header.point_count} points that it declares."
             )
         points = reader.read()
-    names = ["x", "y", "z", *points.point_format.extra_dimension_names]
-    if np.any(points["intensity"]):  # a field of every file, which few fill
-        names.append("intensity")
-    return names, [np.asarray(points[name]) for name in names]
+    names = ["x", "y", "z", *(n for n in points.point_format.dimension_names if n not in "XYZ")]
+    columns = tuple(np.asarray(points[name]) for name in names)
+    # Fields of every file, which few fill.
+    aliases = (n if c.any() else "_" for n, c in zip(names, columns, strict=True))
+    return Cloud(tuple(names), columns, ("x", "y", "z", *list(aliases)[3:]), header=header)
 
 
 READERS = {
@@ -155,6 +188,7 @@ READERS = {
     ".feather": read_arrow,
     ".parquet": read_arrow,
     ".las": read_las,
+    ".laz": read_las,
 }
 
 
@@ -172,3 +206,72 @@ def usual_names(width: int, columns: Sequence[str] | None) -> Sequence[str]:
             "(data.reading.columns=[x,y,z,intensity,_,_])."
         )
     return names
+
+
+def write_las(file: IO[bytes], cloud: Cloud, compressed: bool) -> None:
+    """Write a cloud that `read_las` read, with its header; further fields are extra bytes."""
+    import laspy
+
+    rows = cloud.array()
+    header = deepcopy(cloud.header)
+    known = {"x", "y", "z", *header.point_format.dimension_names}
+    header.add_extra_dims(
+        [
+            laspy.ExtraBytesParams(name, rows.dtype[name])
+            for name in rows.dtype.names or ()
+            if name not in known
+        ]
+    )
+    points = laspy.ScaleAwarePointRecord.zeros(len(rows), header=header)
+    las = laspy.LasData(header, points)
+    for name in rows.dtype.names or ():
+        las[name] = rows[name]
+    content = io.BytesIO()
+    backend = laspy.LazBackend.Lazrs if compressed else None
+    las.write(content, do_compress=compressed, laz_backend=backend)
+    file.write(content.getbuffer())
+
+
+def write_arrow(file: IO[bytes], cloud: Cloud, ending: str) -> None:
+    """Write a Feather or Parquet table with the types and notes of the one that was read."""
+    import pyarrow
+    from pyarrow import feather, parquet
+
+    names = cloud.names or cloud.aliases
+    types = {field.name: field.type for field in cloud.header}
+    arrays = [
+        pyarrow.array(column, types.get(name), from_pandas=column.dtype.kind != "f")
+        for name, column in zip(names, cloud.columns, strict=True)
+    ]
+    table = pyarrow.table(arrays, names).replace_schema_metadata(cloud.header.metadata)
+    (feather.write_feather if ending == ".feather" else parquet.write_table)(table, file)
+
+
+def write_text(file: IO[bytes], cloud: Cloud) -> None:
+    """Write a line per point, each number with as many digits as give it back, below the names."""
+    form = cloud.header
+    if cloud.names is not None:
+        file.write(f"{form.prefix}{form.separator.join(cloud.names)}\n".encode())
+    columns = [map(_digits, column.tolist()) for column in cloud.columns[: cloud.held]]
+    lines = map(form.separator.join, zip(*columns, strict=True))
+    file.writelines(f"{line}\n".encode() for line in lines)
+
+
+def _digits(value: float) -> str:
+    return repr(value).removesuffix(".0")
+
+
+def write_rows(file: IO[bytes], cloud: Cloud) -> None:
+    """Write rows of little-endian float32 without names."""
+    file.write(np.stack(cloud.columns[: cloud.held], axis=1).astype("<f4").tobytes())
+
+
+def write_npy(file: IO[bytes], cloud: Cloud) -> None:
+    """Write named fields, or rows without names, of the types that were read."""
+    if cloud.names is not None:
+        np.save(file, cloud.array())
+        return
+    columns = cloud.columns[: cloud.held]
+    rows = np.empty((len(cloud), len(columns)), columns[0].dtype)
+    rows.T[:] = columns
+    np.save(file, rows)

@@ -1,0 +1,108 @@
+"""Completed clouds: the measured points with all their fields, and added points with theirs."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy import ndarray
+
+from r2flow.lidar.added_times import times_of
+from r2flow.lidar.known import Ray
+from r2flow.lidar.other_sensors import Partial
+from r2flow.lidar.projection import image_points
+from r2flow.lidar.scan_files import Cloud
+from r2flow.lidar.scan_files.cloud import as_type
+from r2flow.lidar.sensors import Sensor
+
+MEASURED = "measured"  # uint8: 1 for a point of the scan, 0 for an added one
+ROW = "image_row"  # uint16: row of the answer's sensor from the top, of every point
+NO_ROW = 65535  # of a measured point outside the view of the answer's sensor
+
+# By name: the value of each ray, (H, W), for added points, and that of all measured points.
+OfRays = Mapping[str, tuple[ndarray, float]]
+
+
+def completed_cloud(
+    given: Partial, image: ndarray, sensor: Sensor, of_rays: OfRays | None = None
+) -> Cloud:
+    """The measured points of a scan, unchanged and in their order, and then the added points.
+
+    Added points lie on the rays of the answer that were not measured. Their ring is the row of the
+    answer's sensor, their time that of the ray (`times_of`), their intensity in the unit of the
+    scan. Fields that r2flow does not understand are NaN in floats and 0 in integers
+    (`unknown_fields`). After the scan's own fields stand `measured`, `image_row` and those
+    `of_rays`, float32.
+
+    Args:
+        given: The scan as the model saw it, with its points and their cloud.
+        image: An answer: range in metres, reflectance in [0, 1] if the model has it, (1 or more, H,
+            W).
+    """
+    points = given.points
+    assert points is not None
+    assert points.cloud is not None
+    assert points.kept is not None
+    assert given.row is not None
+    of_rays = of_rays or {}
+    cloud = points.cloud.take(points.kept)
+    rays = sensor.rays()
+    rows, columns = sensor.shape
+    row_of_ray = np.repeat(np.arange(rows, dtype=np.float32)[:, None], columns, axis=1)
+    strength = image[1] if len(image) > 1 else np.zeros_like(image[0])
+    channels = [image[0], strength, row_of_ray, *(values for values, _ in of_rays.values())]
+    added = np.stack(channels) * (given.state != Ray.RETURN)
+    xyz, (strength, row, *others) = image_points(added.astype(np.float32), rays)
+    count = len(xyz)
+    new = {place: _unknown(column, count) for place, column in enumerate(cloud.columns)}
+
+    def fill(role: str, values: ndarray) -> None:
+        place = cloud.place(role)
+        if place is not None:
+            new[place] = as_type(values, cloud.columns[place].dtype)
+
+    for axis, values in zip("xyz", xyz.T, strict=True):
+        fill(axis, values)
+    fill("ring", row)
+    silent = points.reflectance is None or not points.reflectance.any()
+    fill("reflectance", np.zeros(count) if silent else strength * given.scale)
+    time = cloud.column("time")
+    if time is not None and count:
+        azimuth = np.arctan2(*points.xyz.T[1::-1].astype(float))
+        asked = np.arctan2(*xyz.T[1::-1].astype(float))
+        name = (cloud.names or cloud.aliases)[cloud.place("time") or 0]
+        fill("time", times_of(time, given.row, azimuth, row.astype(int), asked, name))
+    measured = len(cloud)
+    whole = replace(
+        cloud,
+        columns=tuple(
+            np.concatenate([column, new[place]]).astype(column.dtype, copy=False)
+            for place, column in enumerate(cloud.columns)
+        ),
+        shape=None,
+    )
+    more = {
+        MEASURED: np.repeat(np.array([1, 0], np.uint8), [measured, count]),
+        ROW: np.concatenate([np.where(given.row < 0, NO_ROW, given.row), row]).astype(np.uint16),
+    }
+    for (name, (_, of_measured)), values in zip(of_rays.items(), others, strict=True):
+        more[name] = np.concatenate([np.full(measured, of_measured, np.float32), values])
+    return whole.with_fields(more)
+
+
+def unknown_fields(cloud: Cloud) -> list[str]:
+    """The fields of a scan that added points cannot have: they are NaN or 0 there."""
+    known = {cloud.place(role) for role in ("x", "y", "z", "reflectance", "ring", "time")}
+    names = cloud.names or cloud.aliases
+    return [
+        name
+        for place, name in enumerate(names)
+        if place not in known and name not in (MEASURED, ROW)
+    ]
+
+
+def _unknown(column: ndarray, count: int) -> ndarray:
+    """Values of a field, (count,), of points that have none: NaN, 0 or nothing."""
+    empty = {"f": np.nan, "c": np.nan, "M": "NaT", "m": "NaT", "O": None}
+    if column.dtype.kind in empty:
+        return np.full((count, *column.shape[1:]), empty[column.dtype.kind], column.dtype)
+    return np.zeros((count, *column.shape[1:]), column.dtype)

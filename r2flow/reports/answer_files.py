@@ -1,0 +1,101 @@
+"""Files of completed scans: their names, what they hold, and the check of a folder."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray
+from scipy.spatial import cKDTree
+
+from r2flow.base.errors import InputError
+from r2flow.base.files import atomic_write, save_array
+from r2flow.base.progress import track
+from r2flow.data.partial import PartialScan
+from r2flow.lidar.added import completed_cloud
+from r2flow.lidar.known import Ray
+from r2flow.lidar.labels import write_labels
+from r2flow.lidar.other_sensors import Partial
+from r2flow.lidar.projection import image_points
+from r2flow.lidar.scan_files import WRITTEN, scan_ending, write_cloud
+from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.completion import Completed
+from r2flow.reports.answer_rays import Job
+from r2flow.reports.outputs import write_labelled
+from r2flow.store import Store, manifest_of
+
+
+def answer_files(scan: PartialScan, out: Path, num: int) -> list[Path]:
+    """Files of the answers to a scan: of its own format, if it can be written."""
+    if scan.path and (out / scan.name).resolve().parent == scan.path.resolve().parent:
+        raise InputError(f"{out} is the folder of the scans; give another --out.")
+    ending = scan.ending
+    ending = ending if ending in WRITTEN else ".ply"
+    if num == 1:
+        return [out / f"{scan.name}{ending}"]
+    width = len(str(num - 1))
+    return [out / f"{scan.name}_{number:0{width}d}{ending}" for number in range(num)]
+
+
+def check_inputs(
+    store: Store, scans: Sequence[PartialScan], files: Mapping[str, Sequence[Path]]
+) -> dict[str, str]:
+    """Hashes of the scans by name; refuses a folder with other answers."""
+    store.check()
+    before = manifest_of(store.folder).get("inputs", {})
+    inputs = {scan.name: scan.identity() for scan in track(scans, "hashing", "scans")}
+    for name, paths in files.items():
+        if before.get(name) != inputs[name] and any(path.exists() for path in paths):
+            raise InputError(
+                f"{store.folder} holds files of another scan of the name {name}; give another "
+                "--out."
+            )
+    return inputs
+
+
+def write_answers(
+    checkpoint: Checkpoint,
+    scan: PartialScan,
+    files: Sequence[Path],
+    given: Partial,
+    completed: Completed,
+    job: Job,
+) -> None:
+    """Write the answers to a scan, and the spread of several."""
+    out = files[0].parent
+    if len(files) > 1:
+        deviation, returned = completed.spread.numpy()
+        spread = f"{Path(scan.name).name}.spread.npz"
+        with atomic_write(out / spread) as file:
+            np.savez_compressed(file, deviation=deviation, returned=returned)
+    labelled = checkpoint.encoding.labels
+    sensor = checkpoint.sensor
+    silent = given.points.reflectance is None if given.points else len(given.image) == 1
+    silent &= "reflectance" not in job.hide  # else that of the answer would be invented
+    for path, image in zip(files, completed.images.numpy(), strict=True):
+        name = path.name.removesuffix(scan_ending(path.name) or path.suffix)
+        if scan.image:
+            if labelled:
+                write_labelled(image, sensor.rays(), path.parent, name, ["ply"])
+            save_array(path, image[: 1 if silent else 2])
+            continue
+        cloud = completed_cloud(given, image, sensor)
+        drawn = "reflectance" in job.hide and len(image) > 1
+        if labelled or drawn:
+            values = _of_points(given, image, sensor.rays())
+            if labelled:
+                write_labels(path.parent, name, *values[1:])
+            if drawn:
+                cloud = cloud.with_reflectance(values[0] * given.scale)
+        write_cloud(path, cloud)
+
+
+def _of_points(given: Partial, image: ndarray, rays: ndarray) -> ndarray:
+    """The channels of an answer after its range at each point of a completed cloud, (C - 1, N):
+    measured points have those of the nearest measured ray.
+    """
+    assert given.points is not None
+    known = given.state == Ray.RETURN
+    xyz, values = image_points(image * known, rays, given.xyz)
+    _, estimated = image_points(image * ~known, rays)
+    nearest = cKDTree(xyz).query(given.points.xyz)[1]
+    return np.concatenate([values[:, nearest], estimated], axis=1)
