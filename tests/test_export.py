@@ -222,7 +222,7 @@ def test_nearest_returns_are_those_of_torch(turning, ring, rows):
     blocks = 1 if rows == 60 else 11
     parts = returned.unflatten(1, (blocks, -1)).movedim(2, 0).numpy()
     steps = torch.tensor([0.8, 0.6, 0.3, 0.4]).view(2, 2, 1, 1)
-    how = {"turning": int(turning), "ring": int(ring), "domain": BEFORE.domain}
+    how = {"turning": [int(turning)], "ring": [int(ring)], "domain": BEFORE.domain}
     node = make_node("Before", ["parts", "steps"], ["offsets"], **how)
     shapes = {"parts": (9, parts.shape), "steps": (1, steps.shape)}
     inputs = [make_tensor_value_info(name, *value) for name, value in shapes.items()]
@@ -306,9 +306,9 @@ def test_a_scan_without_a_return_in_view_is_refused_and_in_an_export_stays_empty
 @pytest.mark.parametrize(
     "odd",
     [
-        lambda scan: scan[200:201],
-        lambda scan: scan[200:202],
-        lambda scan: np.repeat(scan[200:201], 9, axis=0),
+        lambda scan: scan[:1],
+        lambda scan: scan[:2],
+        lambda scan: np.repeat(scan[:1], 9, axis=0),
         lambda scan: np.concatenate([scan[:99], NAN, 0 * scan[:9], scan[99:]]),
         lambda scan: scan[np.abs(scan[:, 1]) < -0.3 * scan[:, 0]],  # at the turn's seam alone
         lambda scan: scan[::-1],

@@ -282,7 +282,7 @@ def _before(returned: Tensor, steps: Tensor, turning: bool, ring: bool) -> Tenso
         found = torch.onnx.ops.symbolic(
             "r2flow::Before",
             (blocked, steps),
-            {"turning": int(turning), "ring": int(ring)},
+            {"turning": [int(turning)], "ring": [int(ring)]},
             dtype=steps.dtype,
             shape=shape,
         )

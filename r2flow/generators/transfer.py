@@ -273,7 +273,8 @@ class TransferFlow(Flow):
         inputs = self._inputs(about.start + (kept < 1) * noise, about, condition["rows"])
         output = self.backbone(torch.zeros((), device=noise.device), inputs).float()
         metres = self.space.decode(image)
-        compared = hidden & (known[:, 1:2] > 0) & (metres[:, :1] > 0)
+        heard = known[:, 1][:, None] > 0  # OpenVINO refuses a second slice of a slice
+        compared = hidden & heard & (metres[:, :1] > 0)
         error = metres[:, 1:2] - self._read(output, about, gain, 0.0).strength()
         correction = output[:, _STRENGTH] / gain
         shares = torch.linspace(1, 0, 11, device=noise.device)

@@ -100,7 +100,7 @@ class Sight(nn.Module):
         beam = torch.cat([beam, beam.new_zeros(1)])
         count = valid.sum()
         valid = torch.cat([valid, count[None] < 1])
-        only = valid.to(torch.int64).argmax()[None].expand(1)
+        only = valid.to(torch.int32).argmax()[None].expand(1)
         points = torch.cat([points, points[only]])
         elevation = torch.cat([elevation, elevation[only]])
         beam = torch.cat([beam, beam[only]])
@@ -159,7 +159,8 @@ def _azimuth(points: Tensor) -> Tensor:
     """float64: of float32, corrected by a step of Newton's method, as runtimes have no other."""
     x, y = points[:, :2].double().unbind(1)
     a = torch.atan2(points[:, 1], points[:, 0]).double()
-    cos, sin = a.cos(), a.sin()
+    cos = (a + math.pi / 2).sin()  # some runtimes lack the cosine of float64
+    sin = a.sin()
     return a + (y * cos - x * sin) / (x * cos + y * sin).clamp(min=1e-12)
 
 

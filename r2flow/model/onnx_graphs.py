@@ -14,52 +14,66 @@ from onnx.numpy_helper import from_array, to_array
 from onnx.parser import parse_function
 
 # `r2flow.generators.surroundings._before` of `parts`, (L, B, blocks, W), in which row `l` of each
-# block follows row `l - 1`; a sweep is repeated until the blocks' first rows stay.
+# block follows row `l - 1`; a sweep is repeated until the blocks' first rows stay, at most two
+# turns. Bodies use their own inputs and constants alone: some runtimes know no others.
 BEFORE = parse_function("""
 <domain: "r2flow", opset_import: ["" : 18]>
 Before <turning, ring> (parts, steps) => (offsets) {
   front = Constant <value = int64[1] {0}> ()
-  one = Constant <value = int64[1] {1}> ()
   two = Constant <value = int64[1] {2}> ()
-  three = Constant <value = int64[1] {3}> ()
-  back = Constant <value = int64[1] {-1}> ()
-  before_back = Constant <value = int64[1] {-2}> ()
-  most = Constant <value = int64[1] {9223372036854775807}> ()
-  zero = Constant <value = float {0}> ()
+  zero = Constant <value = float[1] {0}> ()
   true = Constant <value = bool {1}> ()
-  moves = Constant <value = float[3,2,1,1,1] {-1, -1, -1, 0, -1, 1}> ()
   log_zero = Log (zero)
   far = Neg (log_zero)
-  turning_number = Constant <value_int: int = @turning> ()
+  turning_number = Constant <value_ints: ints = @turning> ()
   turns = Cast <to = 9> (turning_number)
-  ring_number = Constant <value_int: int = @ring> ()
+  turn_wall = Where (turns, zero, far)
+  ring_number = Constant <value_ints: ints = @ring> ()
   closed = Cast <to = 9> (ring_number)
+  wall = Where (closed, zero, far)
   part = Gather (parts, front)
   both = Concat <axis = 0> (part, part)
   shape = Shape (both)
   start = Expand (far, shape)
   offsets_0 = Unsqueeze (start, front)
-  end, offsets = Loop (, true, start, offsets_0) <body = sweeps (
+  blocks = Gather (shape, two)
+  twice = Mul (blocks, two)
+  most = Squeeze (twice)
+  end, offsets = Loop (most, true, start, offsets_0) <body = sweeps (
     int64 number, bool going, float[2, b, k, w] state_0, float[l, 2, b, k, w] rows_0
   ) => (bool more, float[2, b, k, w] state_1, float[l, 2, b, k, w] rows_1) {
-    last, rows_1 = Scan <num_scan_inputs = 1, body = row (
-      float[2, b, k, w] state, bool[b, k, w] own
-    ) => (float[2, b, k, w] next, float[2, b, k, w] same) {
+    last, wall_1, steps_1, rows_1 = Scan <num_scan_inputs = 1, body = row (
+      float[2, b, k, w] state, float[1] wall_in, float[2, b, 1, 1] steps_in, bool[b, k, w] own
+    ) => (
+      float[2, b, k, w] next, float[1] wall_out, float[2, b, 1, 1] steps_out,
+      float[2, b, k, w] same
+    ) {
+      begin = Constant <value = int64[1] {0}> ()
+      one = Constant <value = int64[1] {1}> ()
+      column = Constant <value = int64[1] {3}> ()
+      back = Constant <value = int64[1] {-1}> ()
+      before_back = Constant <value = int64[1] {-2}> ()
+      beyond = Constant <value = int64[1] {2147483647}> ()
+      none = Constant <value = float[1] {0}> ()
+      moves = Constant <value = float[3,2,1,1,1] {-1, -1, -1, 0, -1, 1}> ()
       same = Identity (state)
-      kept = Where (own, zero, state)
-      first_column = Slice (kept, front, one, three)
-      last_column = Slice (kept, back, most, three)
-      left = Where (closed, last_column, far)
-      right = Where (closed, first_column, far)
+      wall_out = Identity (wall_in)
+      steps_out = Identity (steps_in)
+      kept = Where (own, none, state)
+      first_column = Slice (kept, begin, one, column)
+      last_column = Slice (kept, back, beyond, column)
+      left = Add (last_column, wall_in)
+      right = Add (first_column, wall_in)
       wide = Concat <axis = 3> (left, kept, right)
-      a = Slice (wide, front, before_back, three)
-      c = Slice (wide, two, most, three)
-      a_first = Unsqueeze (a, front)
-      b_first = Unsqueeze (kept, front)
-      c_first = Unsqueeze (c, front)
+      a = Slice (wide, begin, before_back, column)
+      two_in = Constant <value = int64[1] {2}> ()
+      c = Slice (wide, two_in, beyond, column)
+      a_first = Unsqueeze (a, begin)
+      b_first = Unsqueeze (kept, begin)
+      c_first = Unsqueeze (c, begin)
       stay = Concat <axis = 0> (a_first, b_first, c_first)
       moved = Add (stay, moves)
-      angles = Mul (moved, steps)
+      angles = Mul (moved, steps_in)
       squares = Mul (angles, angles)
       square = ReduceSum (squares, one)
       moved_0, moved_1, moved_2 = Split <axis = 0, num_outputs = 3> (moved)
@@ -69,11 +83,15 @@ Before <turning, ring> (parts, steps) => (offsets) {
       least = Min (square_1, square_0)
       nearer_2 = Less (square_2, least)
       best_2 = Where (nearer_2, moved_2, best_1)
-      next = Squeeze (best_2, front)
-    }> (state_0, parts)
-    below = Slice (last, back, most, two)
-    first = Where (turns, below, far)
-    others = Slice (last, front, back, two)
+      next = Squeeze (best_2, begin)
+    }> (state_0, wall, steps, parts)
+    block = Constant <value = int64[1] {2}> ()
+    end_0 = Constant <value = int64[1] {0}> ()
+    end_1 = Constant <value = int64[1] {-1}> ()
+    end_2 = Constant <value = int64[1] {2147483647}> ()
+    below = Slice (last, end_1, end_2, block)
+    first = Add (below, turn_wall)
+    others = Slice (last, end_0, end_1, block)
     state_1 = Concat <axis = 2> (first, others)
     equal = Equal (state_1, state_0)
     equal_number = Cast <to = 6> (equal)
