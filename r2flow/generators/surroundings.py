@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.generators.base import IMAGE, KNOWN, Condition
@@ -91,8 +92,8 @@ class Surroundings(NamedTuple):
             near,
             relative[:, :4],
             strengths[:, :4].clamp(max=1),
-            down.asinh() / 2,
-            across.asinh() / 2,
+            _shrunk(down),
+            _shrunk(across),
             present[:, 4:],
             relative[:, 4:],
             measured,
@@ -213,10 +214,18 @@ def first_present(values: Tensor, present: Tensor, order: Sequence[int], default
 def _moved(values: Tensor, down: Tensor, across: Tensor) -> Tensor:
     """Values of images (C, B, 1, H, W) at offsets in rows and columns, (C, B, N, H, W)."""
     rows, columns = values.shape[3:]
-    row = torch.arange(rows, device=values.device)[:, None] + down.long()
-    column = (torch.arange(columns, device=values.device) + across.long()) % columns
-    pixel = (row * columns + column).flatten(1).expand(len(values), -1, -1)
+    row = torch.arange(rows, device=values.device)[:, None] + down
+    column = torch.arange(columns, device=values.device) + across
+    column = column - columns * (column / columns).floor()  # `%` is ten times as slow
+    pixel = (row * columns + column).long().flatten(1).expand(len(values), -1, -1)
     return values.flatten(2).gather(2, pixel).view(len(values), *down.shape)
+
+
+def _shrunk(offset: Tensor) -> Tensor:
+    """asinh(n) / 2 of whole numbers, from a table: asinh is slow on a CPU."""
+    most = sum(offset.shape[2:])  # a turn, and as many columns as there are rows
+    table = torch.arange(-most, most + 1, dtype=offset.dtype, device=offset.device).asinh() / 2
+    return table.index_select(0, (offset.long() + most).flatten()).view(offset.shape)
 
 
 def _interpolated(
@@ -275,7 +284,12 @@ def _before(returned: Tensor, steps: Tensor, turning: bool, ring: bool) -> Tenso
         ring: Whether the first column follows the last.
     """
     rows = returned.shape[1]
-    blocks = max(n for n in range(1, math.isqrt(rows) + 1) if rows % n == 0) if rows > _FEW else 1
+    blocks = 1
+    if rows > _FEW:
+        blocks = math.isqrt(rows)
+        if turning:  # no row can be added to a turn
+            blocks = max(n for n in range(1, blocks + 1) if rows % n == 0)
+    returned = F.pad(returned, (0, 0, 0, -rows % blocks))
     blocked = returned.unflatten(1, (blocks, -1)).movedim(2, 0)  # (L, B, blocks, W)
     if torch.compiler.is_exporting():  # its steps would be a graph of thousands of nodes
         shape = (len(blocked), 2, *blocked.shape[1:])
@@ -286,37 +300,53 @@ def _before(returned: Tensor, steps: Tensor, turning: bool, ring: bool) -> Tenso
             dtype=steps.dtype,
             shape=shape,
         )
-        return found.movedim(0, 3).flatten(2, 3)
-    parts = blocked.unbind()
-    missing = steps.new_full((2, *parts[0].shape), math.inf)
-    start = missing
-    for _ in range(2 * blocks):  # at most two turns
-        state = start
-        offsets = []
-        for own in parts:
-            offsets.append(state)
-            state = _next(torch.where(own, 0.0, state), steps, ring, missing[..., :1])
-        end = state.roll(1, 2)
+    else:
+        found = _swept(blocked, steps, turning, ring)
+    return found.movedim(0, 3).flatten(2, 3)[:, :, :rows]
+
+
+def _swept(returned: Tensor, steps: Tensor, turning: bool, ring: bool) -> Tensor:
+    """`_before` of rows in blocks, (L, B, blocks, W): offsets, (L, 2, B, blocks, W).
+
+    Those of a row are the nearest of three of the previous row. All steps write to the same memory,
+    for which a CPU would need more time than for the arithmetic.
+    """
+    length, *shape = returned.shape
+    columns = shape[-1]
+    rows = returned.logical_not().unbind()
+    offsets = steps.new_full((length + 1, 2, *shape), math.inf)
+    states = offsets.unbind()
+    wide = steps.new_full((2, *shape[:-1], columns + 2), math.inf)  # with a column on each side
+    previous = wide.unfold(-1, columns, 1).movedim(-2, 0)  # (3, 2, B, blocks, W)
+    moves = steps.new_tensor([[-1, -1], [-1, 0], [-1, 1]]).view(3, 2, *[1] * len(shape))
+    moved = torch.empty_like(previous, memory_format=torch.contiguous_format)
+    angles = torch.empty_like(moved)
+    squares = torch.empty_like(moved[:, 0])
+    best = torch.empty_like(moved[0])
+    nearer = torch.empty_like(squares[0], dtype=torch.bool)
+    inner = previous[1]
+    zero = steps.new_zeros(())
+    left, first, last, right = (wide[..., k] for k in (0, 1, -2, -1))
+    start = states[0].clone()
+    for _ in range(2 * shape[1]):  # at most two turns
+        states[0].copy_(start)
+        for empty, state, following in zip(rows, states[:-1], states[1:], strict=True):
+            torch.where(empty, state, zero, out=inner)
+            if ring:
+                left.copy_(last)
+                right.copy_(first)
+            torch.add(previous, moves, out=moved)
+            torch.mul(moved, steps, out=angles)
+            angles.square_()
+            torch.add(angles[:, 0], angles[:, 1], out=squares)
+            torch.lt(squares[1], squares[0], out=nearer)
+            torch.where(nearer, moved[1], moved[0], out=best)
+            torch.minimum(squares[0], squares[1], out=squares[0])
+            torch.lt(squares[2], squares[0], out=nearer)
+            torch.where(nearer, moved[2], best, out=following)
+        start = states[-1].roll(1, 2)
         if not turning:
-            end[:, :, 0] = math.inf
-        if torch.equal(end, start):
+            start[:, :, 0] = math.inf
+        if torch.equal(start, states[0]):
             break
-        start = end
-    return torch.stack(offsets, 3).flatten(2, 3)
-
-
-def _next(state: Tensor, steps: Tensor, ring: bool, missing: Tensor) -> Tensor:
-    """Offsets of a row, (2, ..., W), from those of the previous row."""
-    columns = state.shape[-1]
-    ends = (state[..., -1:], state[..., :1]) if ring else (missing, missing)
-    down, across = torch.cat([ends[0], state, ends[1]], -1).unbind()
-    down = down - 1
-    height = (down * steps[0]).square()
-    best = state.new_full((3, *state.shape[1:]), math.inf)
-    for first, move in enumerate((-1, 0, 1)):
-        part = slice(first, first + columns)
-        aside = across[..., part] + move
-        square = height[..., part] + (aside * steps[1]).square()
-        one = torch.stack([square, down[..., part], aside])
-        best = torch.where(square < best[0], one, best)
-    return best[1:]
+    return offsets[:-1]

@@ -2,6 +2,8 @@
 
 A row of the image is measured if it contains a beam of the scan's sensor. A pixel of such a row is
 known to be empty only if a ray was fired into it and did not return.
+
+`r2flow.lidar.sight` does the same in torch, for export, in 2.5 to 9 times the time.
 """
 
 import math
