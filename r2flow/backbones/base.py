@@ -31,6 +31,7 @@ class Backbone(ExactBuffers):
     - croppable: It can be evaluated on a part of its image. A layer's `open_ring` ends its wrapping
       of columns.
     - any_size: It takes images of any number of rows and columns.
+    - radius: Rows above and below a ray that its field depends on; None: all.
     - learns_directions: It learns a vector per direction: scans must not be rotated in training.
 
     Its modules may have a method `macs` (`r2flow.reports.backbones.count_macs`).
@@ -50,6 +51,7 @@ class Backbone(ExactBuffers):
     takes_second_time = False
     croppable = False
     any_size = False
+    radius: int | None = None
     learns_directions = False
     coords: Tensor
     interval_embedding: nn.Module

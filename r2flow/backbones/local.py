@@ -35,7 +35,8 @@ class Local(Backbone):
         **common: Any,
     ) -> None:
         super().__init__(rays, (1, 1), **common)
-        # Radius of the receptive field.
+        self.radius = 2 + 2 * len(dilations)
+        # That of the columns.
         self.margin = 2 + 2 * sum(dilations) if ring else 0
         self.time = time_embedding(channels, channels)
         self.image = nn.Conv2d(self.in_channels, channels, 3, padding=1)
@@ -47,7 +48,8 @@ class Local(Backbone):
         margin = self.margin
         if torch.is_autocast_enabled(x.device.type):
             x = x.to(torch.get_autocast_dtype(x.device.type))  # before the copies that follow
-        x = x.contiguous(memory_format=torch.channels_last)  # up to twice as fast on a CPU
+        # In channels_last: up to twice as fast on a CPU; `contiguous` takes twice as long.
+        x = x.flatten(2).mT.contiguous().unflatten(1, x.shape[2:]).movedim(3, 1)
         if margin:
             x = wrapped(x, margin, margin)
         x = self.image(x)  # frees its input

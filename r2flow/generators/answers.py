@@ -31,6 +31,18 @@ class Answers:
     labels: Tensor  # log probability of each class, given a return, (B, K, H, W); K = 0 without
     faint: Tensor | float = FAINT  # `FAINT` in the scan's own units
 
+    def among(self, rows: int, own: slice) -> "Answers":
+        """These rows among `rows` rows, of which the others have no return."""
+        sides = (0, 0, own.start, rows - own.stop)
+        if not any(sides):
+            return self
+        ranges, scales, logits, strengths, labels = (
+            F.pad(value, sides, value=1.0)
+            for value in (self.ranges, self.scales, self.logits, self.strengths, self.labels)
+        )
+        returns = F.pad(self.returns, sides, value=NEVER)
+        return Answers(logits, ranges, scales, returns, strengths, labels, self.faint)
+
     def log_density(self, log_r: Tensor) -> Tensor:
         """log p(log r | return), (B, 1, H, W)."""
         return self._log_densities(log_r).logsumexp(1, keepdim=True)

@@ -221,11 +221,12 @@ class TransferFlow(Flow):
         """The velocity; for s = 1, that of the straight line to the point estimate of x_1."""
         assert condition is not None
         t = torch.as_tensor(t, device=x.device, dtype=torch.float32)
-        answers = self._answered(t, x, condition)
-        last = holds((torch.as_tensor(s) >= 1).all())
-        estimate = self._chosen if last else self._mean
-        self.density = answers if last else None
-        x_1 = _with_known(condition, estimate(answers)).to(x)
+        if holds((torch.as_tensor(s) >= 1).all()):
+            x_1 = self._estimate(t, x, condition)
+        else:
+            self.density = None
+            x_1 = self._mean(self._answered(t, x, condition))
+        x_1 = _with_known(condition, x_1).to(x)
         return ((x_1 - x) / (1 - expand_time(t, x)).clamp(min=_LAST)).to(x)
 
     def map(self, condition: Condition | None = None) -> MeanVelocity:
@@ -256,6 +257,37 @@ class TransferFlow(Flow):
         about = Surroundings(*(condition[name] for name in Surroundings._fields))
         how = (condition[name] for name in ("rows", "gain", "share"))
         return self.answers(t, x.float(), about, *how)
+
+    def _estimate(self, t: Tensor, x: Tensor, condition: Condition) -> Tensor:
+        """The point estimate of x_1, computed where a ray is hidden and likely to return alone."""
+        if torch.compiler.is_exporting():  # runtimes prefer fixed shapes
+            return self._chosen(self._answered(t, x, condition))
+        known = condition[KNOWN]
+        asked = (known < 1).any(1, keepdim=True) & within_reach(known.amax(1, True))
+        near = self._rows_near(asked)
+        part = {name: value[:, :, near] for name, value in condition.items() if value.shape[2] > 1}
+        answers = self._answered(t, x[:, :, near], {**condition, **part})
+        likely = asked[:, :, near] & (answers.returns > 0)
+        ray = likely.flatten().nonzero()[:, 0]
+
+        def rays(values: Tensor) -> Tensor:
+            """Those of the rays, (1, C, 1, N), of (B, C, H, W)."""
+            every = values.expand(-1, -1, *likely.shape[2:]).movedim(1, 0).flatten(1)
+            return every.index_select(1, ray)[None, :, None]
+
+        x_1 = self._empty(known[:, :1]).clone()
+        returned = x_1[:, :, near].movedim(1, 0).flatten(1).clone()
+        returned[:, ray] = self._chosen(Answers(*map(rays, vars(answers).values())))[0, :, 0]
+        x_1[:, :, near] = returned.unflatten(1, (len(x_1), *likely.shape[2:])).movedim(1, 0)
+        self.density = answers.among(x_1.shape[2], near)
+        return x_1
+
+    def _rows_near(self, asked: Tensor) -> slice:
+        """The rows that the network needs to answer the rays asked, (B, 1, H, W)."""
+        rows = asked.shape[2]
+        number = asked.any(3).any(0)[0].nonzero()[:, 0].tolist() or [0]
+        radius = rows if self.backbone.radius is None else self.backbone.radius
+        return slice(max(number[0] - radius, 0), min(number[-1] + radius + 1, rows))
 
     def _share(self, condition: Condition, noise: Tensor, steps: Tensor) -> Tensor:
         """Share of the learned correction of reflectance that suits each scan, (B, 1, 1, 1).

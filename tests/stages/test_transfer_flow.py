@@ -146,12 +146,13 @@ def test_the_correction_of_reflectance_is_tried_on_measured_rows(useful, monkeyp
     k = useful * 0.1 / surroundings._REFLECTANCE
     images[:, 1, 2::4] *= (1 + k) / (1 - k)
     shares = []
-    given = flow.answers
-    monkeypatch.setattr(flow, "answers", lambda *args: shares.append(args[-1]) or given(*args))
+    given = flow._estimate
+    monkeypatch.setattr(
+        flow, "_estimate", lambda *args: shares.append(args[-1]["share"].item()) or given(*args)
+    )
     answered(flow, images, measured(images, "rows:2"))
-    assert [share.item() for share in shares] == [pytest.approx(useful)]
     answered(flow, images[:, :1], measured(images, "rows:2"))
-    assert shares[1].item() == 1  # nothing to try it on
+    assert shares == [pytest.approx(useful), 1]  # the second: nothing to try it on
 
 
 def test_bright_returns_of_another_sensor_are_not_cut_off(flow):
@@ -362,6 +363,28 @@ def test_rows_far_beyond_the_measured_ones_stay_empty(flow):
     state[:, [3, 5]] = int(Ray.RETURN)
     r = flow.space.decode(answered(built(nought=True), images, state).x)[0, 0]
     assert (r > 0).all(1).tolist() == [False, False, True, True, True, True, True, False]
+
+
+@pytest.mark.parametrize("sensor", ["hdl64e", "vlp16"])
+def test_rows_and_rays_left_out_change_no_answer(sensor, monkeypatch):
+    flow = built()
+    flow = flow.at(flow.space.through(build_sensor(sensor, 48, 32)))
+    images = 0.1 + 0.8 * torch.rand(2, 2, 48, 32, generator=torch.Generator().manual_seed(2))
+    images[:, 0] = 40 * images[:, 0] * (images[:, 1] > 0.3)
+    images[:, 1] *= images[:, 0] > 0
+    mask = torch.zeros(2, 48, 32, dtype=torch.bool)
+    mask[0, 14:20:2] = mask[1, 18:26:4] = True
+    seen = []
+    network = flow.backbone.forward
+    monkeypatch.setattr(flow.backbone, "forward", lambda t, x: seen.append(x) or network(t, x))
+    found = answered(flow, images * mask[:, None], ray_states(images, mask)).x
+    assert seen[-1].shape[2] < 48
+    every = lambda *how: flow._chosen(flow._answered(*how))  # noqa: E731
+    monkeypatch.setattr(flow, "_estimate", every)
+    expected = answered(flow, images * mask[:, None], ray_states(images, mask)).x
+    assert seen[-1].shape[2] == 48
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    assert (found != expected[0, :, 0, 0, None, None]).any(1).sum() > 200  # returns
 
 
 def test_a_ray_between_two_returns_of_its_row_starts_between_them(flow):
