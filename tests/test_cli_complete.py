@@ -15,6 +15,7 @@ from r2flow.base.noise import generator
 from r2flow.data.opening import open_scans
 from r2flow.data.partial import open_partial
 from r2flow.data.reading import Reading
+from r2flow.lidar.interpolation import interpolated
 from r2flow.lidar.known import Ray, parse_mask
 from r2flow.lidar.other_sensors import image_through
 from r2flow.lidar.projection import image_to_points, project
@@ -70,6 +71,28 @@ def sparse_scan(path: Path, steps: int = 900) -> np.ndarray:
     xyz = np.stack([9 * np.cos(a), 9 * np.sin(a), 9 * np.tan(e)], -1).reshape(-1, 3)
     write_points(path, xyz)
     return xyz
+
+
+def test_errors_at_hidden_rays_stand_beside_the_best_interpolation(r2flow, run, tmp_path):
+    """In the terminal, in compare.json and on the page; of an answer that is read again."""
+    image = full_scan(tmp_path / "one.npy")
+    given = tmp_path / "one.npy", "-c", run, "--mask=rows:2"
+    said = r2flow("complete", *given, "--out", tmp_path / "out").said
+    answer = np.load(tmp_path / "out" / "one.npy")
+    hidden = np.arange(8)[:, None] % 2 == np.ones(64)
+    known = [
+        interpolated(image * ~hidden, ~hidden, rule) for rule in ("nearest", "linear", "inverse")
+    ]
+    common = hidden & (image[0] > 0) & np.all([one[0] > 0 for one in (answer, *known)], axis=0)
+    off = [abs(image[0] - one[0])[common].mean() for one in (answer, *known)]
+    line = f"mean error {off[0]:.3f} m, best interpolation ({{}}) {min(off[1:]):.3f} m"
+    named = ("nearest", "linear", "linear, 1/r")[int(np.argmin(off[1:]))]
+    assert line.format(named) in said
+    assert line.format(named) in (tmp_path / "out" / "one.html").read_text()
+    noted = json.loads((tmp_path / "out" / "compare.json").read_text())["one"]
+    assert noted["answer"]["mae_common_m"] == pytest.approx(off[0], rel=1e-5)
+    wrong = ((answer[0] > 0) != (image[0] > 0))[hidden].mean()
+    assert noted["answer"]["drop_wrong"] == pytest.approx(wrong)
 
 
 @pytest.mark.parametrize("ending", [".bin", ".npy"])

@@ -4,6 +4,7 @@ import errno
 import io
 import logging
 import os
+import re
 import sys
 import unicodedata
 from collections.abc import Iterator
@@ -64,6 +65,28 @@ def naming(path: str | Path) -> Iterator[None]:
         if str(error).startswith(str(path)):
             raise
         raise type(error)(f"{path}: {error}") from None
+
+
+# What the command line calls an argument, and what Python does.
+_IN_PYTHON = (
+    (r"data\.reading\.\w+=\S+, that of its part of data\.parts, or ", ""),
+    (r"--reflectance-scale ([\d.e+]*[\de])", r"reflectance_scale=\1"),
+    (r"--columns ([\w,]+=?\w+)", r"columns=['\1']"),
+    (r"--from, in Python by sensor", "sensor"),
+    (r"--(\w+)-?(\w*)", r"\1_\2"),
+)
+
+
+@contextmanager
+def in_python() -> Iterator[None]:
+    """Errors name arguments of Python instead of options of the command line."""
+    try:
+        yield
+    except InputError as error:
+        text = str(error)
+        for option, argument in _IN_PYTHON:
+            text = re.sub(option, argument, text)
+        raise type(error)(text.replace("columns_", "columns")) from None
 
 
 _warned: set[tuple[Path, str]] = set()  # folders and kinds of odd values

@@ -17,6 +17,7 @@ from r2flow.data.options import FOLDER, PREPARED, SIMULATED
 from r2flow.data.partial_images import FROM, is_image, read_partial
 from r2flow.data.reading import DIVIDED, Reading, nothing_in_view, reflectance_and_scale
 from r2flow.data.sources import LOOKED_AT, spread, warn_of_frame
+from r2flow.lidar.beams import check_rings
 from r2flow.lidar.estimation import FULL_REFLECTANCE, SURE, full_reflectance, other_sensor
 from r2flow.lidar.known import Ray
 from r2flow.lidar.labels import common_classes, labels_beside, read_labels
@@ -136,7 +137,7 @@ def _files(
     if points := [path for path in paths if path not in images]:
         chosen = [points[number] for number in spread(len(points), LOOKED_AT)]
         scans = {path: measured_points(path, reading.columns) for path in chosen}
-        again = any(scan.cloud.place("measured") is not None for scan in scans.values())
+        again = any(scan.cloud and scan.cloud.place("measured") for scan in scans.values())
         seen = sight(described, scans, reading, named if again else source, scale)
         lines, whole, full = seen.lines, seen.whole, seen.scale or 1.0
         by_points = lambda path: seen.see(path, measured_points(path, reading.columns))  # noqa: E731
@@ -202,6 +203,9 @@ def sight(
             target
         )
     known = source or (target if same else None)
+    for file, points in read.items():
+        with naming(file):
+            check_rings(points)
     odd = bool(stored) or warn_of_frame(read)
     try:
         fired = sensor_of(scans, known)

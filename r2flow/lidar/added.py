@@ -80,7 +80,7 @@ def completed_cloud(
         ),
         shape=None,
     )
-    more = {
+    more: dict[str, ndarray] = {
         MEASURED: np.repeat(np.array([1, 0], np.uint8), [measured, count]),
         ROW: np.concatenate([np.where(given.row < 0, NO_ROW, given.row), row]).astype(np.uint16),
     }

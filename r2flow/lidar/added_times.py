@@ -69,10 +69,7 @@ def times_of(
 
 
 def _cure(name: str) -> str:
-    return (
-        f" Give --columns {name}=_ (of a completer columns): it is then kept for measured points "
-        "alone."
-    )
+    return f" Give --columns {name}=_, and it is kept for measured points alone."
 
 
 def _turning(time: ndarray, row: ndarray, azimuth: ndarray, usable: ndarray, name: str) -> _Turning:

@@ -80,6 +80,26 @@ def find_beams(*scans: Points) -> Beams:
     return replace(beams, of_point=of_point)
 
 
+def check_rings(points: Points) -> None:
+    """Refuse ring numbers that contradict the beams: elevations vary within rings as over all.
+
+    Drivers without ring numbers write 0.
+    """
+    if points.ring is None or not points.ring.any():
+        return
+    elevation = elevations_of(points.xyz)
+    seen = np.isfinite(elevation)
+    ring = points.ring[seen]
+    values = elevation[seen].astype(float)
+    count = np.bincount(ring).clip(1)
+    within = values - (np.bincount(ring, values) / count)[ring]
+    if len(values) and within.var() >= RINGLESS * values.var():
+        raise InputError(
+            "its ring numbers contradict the beams: elevations of a ring differ as those of all "
+            "points. Give --columns ring=_ (the field's name), and beams are found without them."
+        )
+
+
 def _beams_of_files(files: Sequence[Points]) -> Beams:
     """`find_beams` for all rows of the files, with lost rays at the origin, as one array."""
     elevations = [elevations_of(file.xyz) for file in files]

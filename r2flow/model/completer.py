@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy import ndarray
 
-from r2flow.base.errors import IN_MEMORY, InputError
+from r2flow.base.errors import IN_MEMORY, InputError, in_python, naming
 from r2flow.data.partial import Sight
 from r2flow.lidar.added import completed_cloud
 from r2flow.lidar.other_sensors import gaps_unknown
@@ -63,9 +63,15 @@ class Completer:
         Raises:
             InputError: the cloud is no scan of the sensor, or its times or rings contradict it.
         """
+        with in_python():
+            whole = self._completed(self._stored(cloud), number, seed)
+        return whole if isinstance(cloud, Cloud) else whole.array()
+
+    def _stored(self, cloud: Cloud | ndarray) -> Cloud:
         stored = cloud if isinstance(cloud, Cloud) else _of_array(cloud, self._columns)
-        if isinstance(cloud, Cloud) or stored.names is not None:
-            stored = stored.renamed(self._columns)
+        return stored if stored.names is None else stored.renamed(self._columns)
+
+    def _completed(self, stored: Cloud, number: int, seed: int) -> Cloud:
         points = points_of(Path(IN_MEMORY), stored.measured())
         if self._decided is None:
             self._decided = self._decide(points)
@@ -81,9 +87,8 @@ class Completer:
             first=number,
             **self._how,
         )
-        image = completed.images[0].numpy()
-        whole = completed_cloud(given, image, self.sensor)
-        return whole if isinstance(cloud, Cloud) else whole.array()
+        with naming(IN_MEMORY):
+            return completed_cloud(given, completed.images[0].numpy(), self.sensor)
 
 
 def _of_array(array: ndarray, columns: Sequence[str] | None) -> Cloud:

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 from scipy.spatial import cKDTree
+from torch import Tensor
 
-from r2flow.base.errors import InputError
+from r2flow.base.errors import InputError, naming
 from r2flow.base.files import atomic_write, save_array
 from r2flow.base.progress import track
 from r2flow.data.partial import PartialScan
@@ -78,7 +79,8 @@ def write_answers(
                 write_labelled(image, sensor.rays(), path.parent, name, ["ply"])
             save_array(path, image[: 1 if silent else 2])
             continue
-        cloud = completed_cloud(given, image, sensor)
+        with naming(scan.path or scan.name):
+            cloud = completed_cloud(given, image, sensor)
         drawn = "reflectance" in job.hide and len(image) > 1
         if labelled or drawn:
             values = _of_points(given, image, sensor.rays())
@@ -89,7 +91,7 @@ def write_answers(
         write_cloud(path, cloud)
 
 
-def _of_points(given: Partial, image: ndarray, rays: ndarray) -> ndarray:
+def _of_points(given: Partial, image: ndarray, rays: Tensor) -> ndarray:
     """The channels of an answer after its range at each point of a completed cloud, (C - 1, N):
     measured points have those of the nearest measured ray.
     """

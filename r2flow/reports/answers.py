@@ -17,9 +17,17 @@ from r2flow.lidar.other_sensors import Partial
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import Completed, complete
 from r2flow.reports.answer_counts import Counts, print_counts
+from r2flow.reports.answer_errors import (
+    COMPARE,
+    Compared,
+    Errors,
+    compared,
+    in_words,
+    write_errors,
+)
 from r2flow.reports.answer_files import answer_files, check_inputs, write_answers
 from r2flow.reports.answer_pictures import draw_answers
-from r2flow.reports.answer_rays import Job, known_rays
+from r2flow.reports.answer_rays import Job, known_rays, measured_rays
 from r2flow.reports.outputs import recipe_of
 from r2flow.store import Store, manifest_of
 
@@ -56,6 +64,7 @@ def write_completed(
         if not all(path.is_file() for path in files[scan.name])
     ]
     counts = Counts()
+    errors: dict[str, Errors] = {}
     batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
     bar = Bar("completing", len(left) * job.num, "answers", evaluations=len(left) * batches)
 
@@ -95,11 +104,19 @@ def write_completed(
             done = chain([write(left[0], *first)], others)
         for number, (given, completed) in zip(left, done, strict=True):
             scan = scans[number]
+            beside: Compared | None = None
+            if job.mask is not None and "range" not in job.hide:
+                measured = measured_rays(scan, job)
+                beside = compared(measured, given, completed, checkpoint.sensor)
+                errors[scan.name] = beside.errors
+                write_errors(out, {scan.name: beside.errors})
             if number < job.pictures:
-                draw_answers(checkpoint.sensor, scan, out, given, completed)
+                draw_answers(checkpoint.sensor, scan, out, given, completed, beside)
             counts.add(scan, given, completed)
         bar.set(len(left) * job.num)
     print_counts(checkpoint.sensor, counts)
+    if errors:
+        print(f"{in_words([*errors.values()])}; see {out / COMPARE}")
     written = f"{len(left)} scan{'' if len(left) == 1 else 's'} written to {out}"
     skipped = [f"{len(scans) - len(left)} there already"] if len(left) < len(scans) else []
     new = [f"{counts.added / len(left) / job.num:,.0f} new points a scan"] if left else []

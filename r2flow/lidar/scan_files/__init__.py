@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 from numpy import ndarray
@@ -269,12 +269,13 @@ def write_cloud(path: Path, cloud: Cloud) -> None:
         rows = cloud.array() if cloud.names is None else None
         if rows is not None and ending in (".pcd", ".ply"):  # these name their fields
             cloud = replace(Cloud.of(rows), header=cloud.header)
-        with atomic_write(path) as file:
-            _WRITERS[ending](file, cloud)
         others = () if cloud.names or rows is None else (rows.dtype.names or ())[cloud.held :]
         if rows is not None and others:
+            fields: Any = {name: rows[name] for name in others}
             with atomic_write(beside(path)) as file:
-                np.savez_compressed(file, **{name: rows[name] for name in others})
+                np.savez_compressed(file, **fields)
+        with atomic_write(path) as file:
+            _WRITERS[ending](file, cloud)
 
 
 def scan_ending(name: str) -> str:

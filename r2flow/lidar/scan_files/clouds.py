@@ -62,8 +62,8 @@ def read_pcd(path: Path) -> Cloud:
     sizes = header.get("POINTS") or header["WIDTH"] + header["HEIGHT"]
     count = math.prod(map(int, sizes))
     encoding = header["DATA"][0]
-    width, height = [*map(int, header.get("WIDTH", "0") + header.get("HEIGHT", "0")), 0][:2]
-    grid = (height, width) if height > 1 and height * width == count else None
+    wide, high = (int(header.get(key, ["0"])[0]) for key in ("WIDTH", "HEIGHT"))
+    grid = (high, wide) if high > 1 and high * wide == count else None
 
     def cloud(columns: list[ndarray]) -> Cloud:
         kept = [place for place, name in enumerate(names) if name != PADDING]

@@ -59,8 +59,8 @@ def read_rows(path: Path, columns: Sequence[str] | None) -> Cloud:
             "or of other columns (--columns x,y,z,intensity,ring)?"
         )
     named = columns or (("x", "y", "z", "intensity", "ring") if width == 5 else None)
-    names = tuple(usual_names(width, named))
-    return Cloud(None, tuple(values.reshape(-1, width).T), names, held=width)
+    known = tuple(usual_names(width, named))
+    return Cloud(None, tuple(values.reshape(-1, width).T), known, held=width)
 
 
 def read_array(path: Path) -> ndarray:
@@ -121,14 +121,28 @@ def read_text(path: Path) -> Cloud:
         return Cloud(None, tuple(table.T), header=form)
     if len(words) < width and not np.isnan(table[:, -1]).all():
         raise InputError("rows are longer than the names.")
-    return Cloud(stored[:width], _exact(table, rows, separator), tuple(names[:width]), header=form)
+    known = tuple(names[:width])
+    columns = _columns_of(table, rows, separator, known)
+    return Cloud(stored[:width], columns, known, header=form)
 
 
-def _exact(table: ndarray, rows: Sequence[str], separator: str | None) -> tuple[ndarray, ...]:
-    """The columns of a text; integers that float64 would round, as nanoseconds, are read again."""
+def _columns_of(
+    table: ndarray, rows: Sequence[str], separator: str | None, names: Sequence[str]
+) -> tuple[ndarray, ...]:
+    """The columns of a text: of integers, if all are, but for coordinates. Those that float64 would
+    round, as nanoseconds, are read again.
+    """
     columns = [*table.T]
-    for place, column in enumerate(columns):
-        if abs(column[0]) >= 2**53 and (rows[0].split(separator)[place].strip(" +-")).isdigit():
+    words = rows[0].split(separator)
+    del columns[len(names) :]  # of separators at the end
+    for place, (column, word, name) in enumerate(zip(columns, words, names, strict=False)):
+        if role_of(name) in ("x", "y", "z") or not word.strip(" +-").isdigit():
+            continue
+        if not (column % 1 == 0).all():
+            continue
+        if abs(column).max() < 2**53:
+            columns[place] = column.astype(np.int64)
+        else:
             columns[place] = np.loadtxt(
                 rows, np.int64, delimiter=separator, comments=None, usecols=place, ndmin=1
             )
