@@ -158,7 +158,7 @@ def trained(experiment: str, repeats: int, more: list[str]) -> dict[str, Any]:
         fit(run)
     steps = watch.seconds[1:]
     return {
-        "experiment": experiment, "batch": run.config["data"]["batch_size"], "step_s": statistics.median(steps),
+        "experiment": experiment, "batch": run.config.data.batch_size, "step_s": statistics.median(steps),
         "least_s": min(steps), "most_s": max(steps),
         "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
     }  # fmt: skip

@@ -12,7 +12,7 @@ same command, or the same config, resumes from the last checkpoint.
 import logging
 import re
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from signal import SIG_DFL
 from subprocess import Popen, TimeoutExpired
@@ -26,13 +26,14 @@ from r2flow.base.errors import InputError, check_folder, one_line
 from r2flow.base.signals import LATER, STOPPING, Stopped, handling_signals
 from r2flow.callbacks.loggers import log_config
 from r2flow.callbacks.stopping import Stopping
+from r2flow.model.config import RunConfig
 from r2flow.model.paths import checkpoints_of, step_of
 from r2flow.reports.training import finish, read_curves
 from r2flow.runs.building import Run, build, check, quiet
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import has_ended, open_run, run_lock
 
-__all__ = ["Result", "Run", "build", "check", "compose", "fit"]
+__all__ = ["Result", "Run", "RunConfig", "build", "check", "compose", "fit"]
 
 log = logging.getLogger("r2flow")
 
@@ -72,12 +73,12 @@ def fit(run: Run) -> Result:
     stopping.run_dir = run.folder
     first = run.trainer.is_global_zero
     with stopping.handling_signals(), quiet(repeated=False):  # each trains on scans of its own
-        if run.config["trainer"]["fast_dev_run"]:
+        if run.config.trainer.fast_dev_run:
             run.trainer.fit(run.stage, run.data)
             return _result(run, run.trainer.global_step, finished=True)
         with quiet():
             run.data.setup()
-            run.config["scans"] = run.data.fingerprint()
+            run.config = replace(run.config, scans=run.data.fingerprint())
             log.info("training on %s", run.data.summary())
             if first and not run.folder.exists():
                 check_folder(run.folder)
@@ -92,14 +93,14 @@ def fit(run: Run) -> Result:
             if first:
                 where = run.trainer.strategy.root_device
                 device = str(where) if where.type == "cuda" else "cpu"
-                samples = run.config["samples"]
-                finish(run.folder, samples, run.config["seed"], device, finished, kept=kept)
+                num = run.config.samples.num
+                finish(run.folder, num, run.config.seed, device, finished, kept=kept)
     return _result(run, step, finished)
 
 
 def _fit_in_folder(run: Run, stopping: Stopping) -> int:
     first = run.trainer.is_global_zero
-    last = open_run(run.folder, run.config, locked=first)
+    last = open_run(run.folder, run.config.plain(), locked=first)
     if last is not None and has_ended(run.folder, last):
         if first:
             parent = as_override("stage.parent", run.folder)
@@ -110,7 +111,7 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
         if last is not None:
             log.info("resuming from %s", last)
     if first:
-        log_config(run.trainer.loggers, run.config)
+        log_config(run.trainer.loggers, run.config.plain())
     try:
         validates = is_overridden("validation_step", run.stage)
         if last is None and run.stage.hparams["parent"] and validates:

@@ -12,7 +12,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from r2flow.callbacks import CALLBACKS
 
 from r2flow.backbones import BACKBONES, configurations
-from r2flow.base.config import FREE, LINKS, as_override, flatten, key_of
+from r2flow.base.config import as_override, flatten, key_of, rules_in
 from r2flow.base.errors import InputError
 from r2flow.base.registry import options_of
 from r2flow.data.augment import Augmentation
@@ -20,6 +20,7 @@ from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.options import DataOptions, PairOptions, ReadingOptions, ValidationOptions
 from r2flow.flow.maps import JumpTimes
 from r2flow.flow.times import TIMES
+from r2flow.model.config import RunConfig, is_free, links_of_key
 from r2flow.model.lineage import Parent
 from r2flow.model.parts import MODEL
 from r2flow.runs.composing import CONF, choices, compose
@@ -43,22 +44,56 @@ def test_the_key_of_an_override():
     assert list(map(key_of, overrides.split())) == keys
 
 
-def test_every_rule_is_of_a_key_that_exists(config):
-    keys = {key for key, _ in flatten(config)} | {
-        "experiment",
-        "size",
-        "hydra",
-        "data.parts.*.root",
-    }
-    keys |= {
+def test_every_key_has_a_type(config):
+    known = rules_in(RunConfig)
+    for key, _ in flatten(config):
+        of_a_class = key.split(".")[0] in ("stage", "backbone", "sensor", "encoding", "callbacks")
+        groups = {"data.augment", "data.pairs.sampler", "sampler"}
+        within = any(key.startswith(f"{group}.") for group in groups)
+        assert key in known or of_a_class or within, key
+
+
+def test_the_free_keys_are_those_that_do_not_affect_the_weights():
+    free = ["data.root", "data.parts.0.root", "data.scans.root", "data.validation.data.root"]
+    free += [
+        "data.workers",
+        "data.memory_gib",
+        "data.pairs.of",
         "stage.parent.path",
-        "stage.parent.pairs",
-        "data.validation.data.root",
-        "data.scans.root",
-        *(f"callbacks.{name}" for name in CALLBACKS),
-    }
-    for key in FREE | LINKS.keys():
-        assert any(known == key or known.startswith(f"{key}.") for known in keys), key
+        "sampler.steps",
+    ]
+    free += [
+        "trainer.devices",
+        "trainer.precision",
+        "callbacks.pictures.num",
+        "samples.num",
+        "name",
+    ]
+    assert all(map(is_free, free))
+    fixed = [
+        "data.name",
+        "data.batch_size",
+        "data.parts.0.weight",
+        "data.pairs.num",
+        "data.scans.name",
+    ]
+    fixed += ["stage.learning_rate", "stage.parent.weights", "callbacks.ema.decay", "seed", "scans"]
+    fixed += ["trainer.max_steps", "trainer.accumulate_grad_batches", "callbacks.of_a_plug_in.x"]
+    assert not any(map(is_free, fixed))
+
+
+@pytest.mark.parametrize(
+    ("override", "links"),
+    {
+        "experiment=x": "none", "size=small": "none", "hydra.mode=x": "none", "name=x": "none", "chain.rf1.seed=2": "none",
+        "data=folder": "scans", "data.root=x": "scans", "data.a_key_of_tomorrow=1": "scans", "sensor.rows=4": "scans",
+        "backbone@_global_.backbone=hdit": "scans", "data.validation.data.root=x": "scans",
+        "data.batch_size=2": "all", "data.validation.share=0.1": "all", "trainer.max_steps=2": "all", "+trainer.x=1": "all",
+        "data.workers=1": "all", "data.pairs.num=2": "pairs", "data.scans.name=x": "pairs", "seed=1": "all",
+    }.items(),
+)  # fmt: skip
+def test_links_of_a_chain_take_what_concerns_them(override: str, links: str):
+    assert links_of_key(override) == links
 
 
 Entry = tuple[str, Callable[..., Any], dict[str, Any], set[str]]
@@ -227,7 +262,7 @@ def test_a_chosen_backbone_is_whole_at_every_size(backbone: str):
 @pytest.mark.parametrize("asked", ["backbone=hdit_small", "backbone.depths=[1]"])
 def test_a_backbone_for_a_system_with_its_own_network_is_refused(asked: str):
     command = ["experiment=vanilla_gan", "size=small"]
-    gan = check(compose(command), command)
+    gan = check(compose(command), command).plain()
     with pytest.raises(InputError, match=r"stage\.parent names a run without a backbone"):
         check(compose(["stage=flow_map", "data=pairs"]), parent=Parent(gan, Path("gan")))
     with pytest.raises(InputError, match="stage=gan has its own network: leave the backbone out"):

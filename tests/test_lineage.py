@@ -46,7 +46,8 @@ def child(parent: Path, reflectance) -> dict:
 
 
 def completed(config: dict, asked: list[str], parent: Parent | None = None) -> dict:
-    return check({**compose(["trainer.accelerator=cpu"]), **config}, asked, parent)
+    config = {**compose(["trainer.accelerator=cpu"]), **config}
+    return check(config, asked, parent).plain()
 
 
 @pytest.mark.parametrize("asked", [[], ["encoding"], ["encoding.reflectance"]])

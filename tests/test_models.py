@@ -10,7 +10,6 @@ import torch
 from safetensors import safe_open
 
 import r2flow
-from r2flow.base.config import learned
 from r2flow.base.errors import InputError
 from r2flow.evaluation.sets import is_checkpoint
 from r2flow.lidar.interpolation import interpolated
@@ -18,6 +17,7 @@ from r2flow.lidar.known import parse_mask, ray_states
 from r2flow.lidar.sensors import build_sensor
 from r2flow.metrics.completion import errors
 from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.config import learned
 from r2flow.model.paths import find_checkpoint
 from r2flow.model.saving import save_checkpoint
 from r2flow.model.shipped import MODELS, find_model, name_of

@@ -11,10 +11,10 @@ from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 
 from r2flow.base.config import check_tree
 from r2flow.base.errors import InputError
+from r2flow.model.config import contradictions
 from r2flow.runs.folder import (
     RESUMED,
     check_run,
-    contradictions,
     has_ended,
     open_run,
     read_config,
@@ -50,8 +50,8 @@ def checkpoint(run: Path, step: int, lacking: str = "", **notes: int) -> Path:
 
 
 def test_where_it_computes_may_change_and_what_may_not(tmp_path: Path):
-    assert contradictions(CONFIG, changed(trainer={"devices": 4}, data={"root": "moved"})) == []
-    assert contradictions(CONFIG, changed(seed=1)) == ["seed=0 there, 1 here"]
+    assert contradictions(CONFIG, changed(trainer={"devices": 4}, data={"root": "moved"})) == {}
+    assert contradictions(CONFIG, changed(seed=1)) == {"seed": "seed=0 there, 1 here"}
     open_run(tmp_path, changed(seed=3))
     assert open_run(tmp_path, CONFIG) is None  # a folder in which nothing was learned is free
     newest = checkpoint(tmp_path, 5)
@@ -88,10 +88,10 @@ def test_the_parent_may_move_and_must_have_the_same_weights():
             stage={"parent": {"path": path, "weights": weights, "pairs": f"{path}/pairs"}}
         )
 
-    assert contradictions(from_parent("a", "1f"), from_parent("moved", "1f")) == []
-    assert contradictions(from_parent("a", "1f"), from_parent("a", "2e")) == [
-        "stage.parent.weights=1f there, 2e here"
-    ]
+    assert contradictions(from_parent("a", "1f"), from_parent("moved", "1f")) == {}
+    assert contradictions(from_parent("a", "1f"), from_parent("a", "2e")) == {
+        "stage.parent.weights": "stage.parent.weights=1f there, 2e here"
+    }
 
 
 @pytest.mark.parametrize("trainer", [{"max_steps": -1, "max_epochs": 2}, None])
@@ -131,12 +131,15 @@ def test_each_part_of_a_mixture_may_move_and_must_stay_what_it_is():
             }
         }
 
-    assert contradictions(parts("b", 1), parts("moved", 1)) == []
-    assert contradictions(parts("b", 1), parts("b", 2)) == ["data.parts.1.weight=1 there, 2 here"]
+    assert contradictions(parts("b", 1), parts("moved", 1)) == {}
+    assert contradictions(parts("b", 1), parts("b", 2)) == {
+        "data.parts.1.weight": "data.parts.1.weight=1 there, 2 here"
+    }
 
 
 HOLD = """
 import sys, time
+from r2flow.model.config import contradictions
 from r2flow.runs.folder import run_lock
 with run_lock(sys.argv[1]):
     print("held", flush=True)

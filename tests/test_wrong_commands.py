@@ -224,7 +224,7 @@ def listing(folder: Path) -> dict[Path, tuple[int, int]]:
 @pytest.fixture
 def refused(place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
     def ready(run: r2flow.training.Run) -> None:
-        if run.config["data"]["name"] != "simulated":
+        if run.config.data.name != "simulated":
             run.data.read()
         raise AssertionError("it would train")
 

@@ -1,91 +1,67 @@
-"""Rules of config keys: whether a key may change on resume, and which links of a chain it applies
-to.
-
-Constructors document and type the keys; defaults are in `conf/`. A rule of a group is that of its
-keys, too.
+"""Configs as trees of keys: the rules in the annotations of their dataclasses, comparison, Hydra's
+overrides.
 """
 
 import json
 import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, is_dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_type_hints
 
-from r2flow.base.registry import Config, Options
+from r2flow.base.registry import Options
 
-# May differ on resume, since they do not affect the result. data.pairs.parent identifies the flow
-# of data.pairs.of.
-FREE = {
-    "experiment",
-    "size",
-    "hydra",
-    "name",
-    "run_dir",
-    "chain",
-    "preview",
-    "plugins",
-    "loggers",
-    "samples",
-    "sampler",
-    "few",
-    "stage.parent.path",
-    "stage.parent.pairs",
-    "data.root",
-    "data.parts.*.root",
-    "data.validation.data.root",
-    "data.workers",
-    "data.memory_gib",
-    "data.pairs.of",
-    "data.scans.root",
-    "callbacks.reflow_pairs",
-    "callbacks.pictures",
-    "callbacks.curvature",
-    "callbacks.guard",
-    "callbacks.requeue",
-    "callbacks.checkpoint",
-    "callbacks.progress",
-    "trainer.accelerator",
-    "trainer.strategy",
-    "trainer.devices",
-    "trainer.num_nodes",
-    "trainer.precision",
-    "trainer.default_root_dir",
-    "trainer.enable_progress_bar",
-    "trainer.log_every_n_steps",
-    "trainer.max_time",
-    "trainer.profiler",
-    "trainer.val_check_interval",
-}
-
-# Links of a chain that take a key from the chain's command line: none, those that read scans
-# (others inherit from them), those trained on pairs; of other keys all links.
-LINKS = {
-    **dict.fromkeys(("experiment", "size", "hydra", "name", "run_dir", "chain", "preview"), "none"),
-    **dict.fromkeys(("sensor", "encoding", "generator", "backbone", "data"), "scans"),
-    **dict.fromkeys(
-        ("data.validation", "data.batch_size", "data.workers", "data.memory_gib"), "all"
-    ),
-    "data.validation.data": "scans",
-    "data.pairs": "pairs",
-    "data.scans": "pairs",
-}
+T = TypeVar("T")
 
 
-def _groups(key: str) -> list[str]:
-    """A key such as `data.parts.0.root` with stars for numbers, and its groups, innermost first."""
-    parts = re.sub(r"\.\d+(?=\.|$)", ".*", key).split(".")
-    return [".".join(parts[:n]) for n in range(len(parts), 0, -1)]
+@dataclass(frozen=True)
+class Rule:
+    """Metadata of a config's field, which holds for the keys of its group, too."""
+
+    free: bool = False  # may differ on resumption, since it does not affect the result
+    found: bool = False  # filled in by the run, from its scans or its parent
+    # Links of a chain that take it from the chain's command line: none, those that read scans
+    # (others inherit from them), those trained on pairs; None: as of the group, else all.
+    links: Literal["all", "none", "scans", "pairs"] | None = None
 
 
-def is_free(key: str) -> bool:
-    """Whether a key may differ on resume."""
-    return not FREE.isdisjoint(_groups(key))
+Free = Annotated[T, Rule(free=True)]
+Found = Annotated[T, Rule(found=True)]
 
 
-def links_of_key(key: str) -> str:
-    """The links of a chain that take a key from the command line, as in `LINKS`."""
-    return next((LINKS[group] for group in _groups(key) if group in LINKS), "all")
+@cache
+def rules_in(kind: Any) -> Mapping[str, Sequence[Rule]]:
+    """The rules of the keys of a dataclass of options: `data.parts.root` for the root of each part.
+
+    A mapping annotated with a dataclass has the keys of that.
+    """
+    table: dict[str, Sequence[Rule]] = {}
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        members = list(_members(hint))
+        table[name] = [one for one in members if isinstance(one, Rule)]
+        for group in filter(is_dataclass, members):
+            if isinstance(group, type):
+                table |= {f"{name}.{key}": own for key, own in rules_in(group).items()}
+    return table
+
+
+def _members(hint: Any) -> Iterator[Any]:
+    """The classes that an annotation is made of, and its metadata."""
+    yield from getattr(hint, "__metadata__", ())
+    inner = [hint.__origin__] if hasattr(hint, "__metadata__") else get_args(hint)
+    for one in inner:
+        yield from _members(one)
+    if not inner:
+        yield hint
+
+
+def rules_of(kind: Any, key: str) -> list[Rule]:
+    """The rules of a key such as `data.parts.0.root`: its own, then those of its groups."""
+    parts = [part for part in key.split(".") if not part.isdecimal()]
+    groups = [".".join(parts[:n]) for n in range(len(parts), 0, -1)]
+    return [rule for group in groups for rule in rules_in(kind).get(group, ())]
 
 
 def key_of(override: str) -> str:
@@ -96,7 +72,7 @@ def key_of(override: str) -> str:
 def flatten(config: Options, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """('a.b', value) for every leaf of a nested mapping; groups in a list are numbered, 'a.0.b'."""
     for key, value in config.items():
-        if _lists_groups(value):
+        if is_groups(value):
             value = dict(enumerate(value))
         if isinstance(value, Mapping):
             yield from flatten(value, f"{prefix}{key}.")
@@ -104,7 +80,8 @@ def flatten(config: Options, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield f"{prefix}{key}", value
 
 
-def _lists_groups(value: Any) -> bool:
+def is_groups(value: Any) -> bool:
+    """Whether a value is a list of groups."""
     listed = isinstance(value, list | tuple) and len(value) > 0
     return listed and all(isinstance(group, Mapping) for group in value)
 
@@ -152,20 +129,6 @@ def _size(value: Any, known: dict[int, int]) -> int:
         parts = value.values() if isinstance(value, Mapping) else value
         known[id(value)] = 1 + sum(_size(part, known) for part in parts)
     return known[id(value)]
-
-
-def learned(config: Options, prefix: str = "") -> Config:
-    """A config without its free keys: the settings that affect the result."""
-    fixed: Config = {}
-    for key, value in config.items():
-        if isinstance(value, Mapping) and value:
-            if inner := learned(value, f"{prefix}{key}."):
-                fixed[key] = inner
-        elif not is_free(f"{prefix}{key}"):
-            fixed[key] = value
-            if _lists_groups(value):
-                fixed[key] = [learned(group, f"{prefix}{key}.*.") for group in value]
-    return fixed
 
 
 def override(key: str, value: Any) -> str:

@@ -11,9 +11,16 @@ from importlib.resources import files
 from pkgutil import resolve_name
 from typing import Annotated, Any, ClassVar, NamedTuple, NotRequired, Required, TypeVar
 
-from annotated_types import Ge, Gt, Le, Lt
 from omegaconf import OmegaConf
-from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, with_config
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    with_config,
+)
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from r2flow.base.errors import InputError
@@ -26,13 +33,22 @@ Config = dict[str, Any]  # a config, or a part of one
 MISSING = "???"  # OmegaConf's mandatory value
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
 
-Count = Annotated[int, Ge(1)]
-Natural = Annotated[int, Ge(0)]
-Positive = Annotated[float, Gt(0)]
-NonNegative = Annotated[float, Ge(0)]
-Seed = Annotated[int, Ge(0), Lt(2**63)]
-Portion = Annotated[float, Ge(0), Lt(1)]
-Share = Annotated[float, Ge(0), Le(1)]
+
+def _refuse_bool(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError("must be a number")
+    return value
+
+
+Integer = Annotated[int, Field(ge=-(2**63), lt=2**63), BeforeValidator(_refuse_bool)]
+Number = Annotated[float, BeforeValidator(_refuse_bool)]
+Count = Annotated[Integer, Field(ge=1)]
+Natural = Annotated[Integer, Field(ge=0)]
+Positive = Annotated[Number, Field(gt=0)]
+NonNegative = Annotated[Number, Field(ge=0)]
+Seed = Natural
+Portion = Annotated[Number, Field(ge=0, lt=1)]
+Share = Annotated[Number, Field(ge=0, le=1)]
 Counts = Annotated[Sequence[Count], Field(min_length=1)]
 Size = tuple[Count, Count]  # rows and columns
 

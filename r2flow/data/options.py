@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from r2flow.base.config import Found, Free, Rule
 from r2flow.base.errors import InputError
 from r2flow.base.registry import Count, Natural, NonNegative, Portion, Positive, Seed, strict
 from r2flow.generators.base import Precision
@@ -22,6 +23,7 @@ FOLDER = "folder"
 MIXED = "mixed"
 PAIRS = "pairs"
 Data = dict[str, Any]  # of a config
+_OfAll = Rule(links="all")  # links of a chain
 
 
 @strict
@@ -52,7 +54,7 @@ class SourceOptions:
     """One set of scans."""
 
     name: str = SIMULATED  # kind of scans: a name in `r2flow.data.opening.SOURCES`
-    root: str | int | None = None  # folder of the data set
+    root: Free[str | int | None] = None  # folder of the data set
     split: str | None = None  # part of the data set's standard split; None takes all
     drives: list[str | int] | None = None  # names or numbers of the drives to take; None takes all
     scenes: Annotated[int, Field(ge=1, le=10**7)] = 512  # number of simulated scenes
@@ -89,7 +91,7 @@ class ValidationOptions:
     share: Portion = 0.1  # approximate share of the scans to hold out, in one contiguous block
     scans: Natural = 64  # maximum number of validation scans
     # another set of scans to hold out instead: {name, root, split, drives, ...}
-    data: Mapping[str, Any] | None = None
+    data: Annotated[Mapping[str, Any] | None, SourceOptions, Rule(links="scans")] = None
 
 
 @strict
@@ -107,8 +109,8 @@ class PairOptions:
     # index of the first pair; None: after the pairs that the flow itself was trained on
     first: Seed | None = None
     precision: Precision = "32-true"  # precision of the network
-    of: str | None = None  # the flow that draws the pairs; None: the stage's parent
-    parent: str | None = None  # hash of the flow, filled in by the run
+    of: Free[str | None] = None  # the flow that draws the pairs; None: the stage's parent
+    parent: Found[str | None] = None  # hash of the flow, filled in by the run
 
     def __post_init__(self) -> None:
         build_sampler(self.sampler)
@@ -125,17 +127,19 @@ class DataOptions(SourceOptions):
     """
 
     # of `mixed`: {name, root, split, drives, ..., weight} each
-    parts: Sequence[Mapping[str, Any]] | None = None
+    parts: Sequence[Annotated[Mapping[str, Any], PartOptions]] | None = None
     # `r2flow.data.augment.Augmentation`, of training scans only
     augment: Mapping[str, Any] | None = None
-    batch_size: Count = 4  # images in one optimiser step, over all devices and accumulated batches
-    workers: Annotated[int, Field(ge=0, le=1000)] = 0  # loader processes per device
+    # images in one optimiser step, over all devices and accumulated batches
+    batch_size: Annotated[Count, _OfAll] = 4
+    # loader processes per device
+    workers: Annotated[Natural, Field(le=1000), _OfAll, Rule(free=True)] = 0
     # training scans that fit into this are kept in memory, others read when needed
-    memory_gib: NonNegative = 2.0
-    validation: ValidationOptions = ValidationOptions()
-    pairs: PairOptions = PairOptions()
+    memory_gib: Annotated[NonNegative, _OfAll, Rule(free=True)] = 2.0
+    validation: Annotated[ValidationOptions, _OfAll] = ValidationOptions()
+    pairs: Annotated[PairOptions, Rule(links="pairs")] = PairOptions()
     # `SourceOptions` of scans next to pairs, for the velocities of a flow map
-    scans: Mapping[str, Any] | None = None
+    scans: Annotated[Mapping[str, Any] | None, SourceOptions, Rule(links="pairs")] = None
 
     def __post_init__(self) -> None:
         for key, name in (("parts", MIXED), ("scans", PAIRS)):

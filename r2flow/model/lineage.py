@@ -1,7 +1,7 @@
 """Lineage: what a stage takes from the trained model that it starts from."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +9,15 @@ from torch import nn
 
 from r2flow.backbones import BACKBONES
 from r2flow.base.errors import InputError
-from r2flow.base.registry import Config, Options, options_of
+from r2flow.base.registry import Config, Options, construct, options_of
+from r2flow.data.options import ReadingOptions
 from r2flow.data.pairs import default_folder
 from r2flow.data.reading import AUTO
 from r2flow.generators import GENERATORS
 from r2flow.lidar.encoding import encoding_options
 from r2flow.lidar.sensors import sensor_options
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint
+from r2flow.model.config import ParentRecord
 from r2flow.model.saving import weights_hash
 from r2flow.model.shipped import name_of
 
@@ -36,22 +38,25 @@ class Parent:
     step: int = 0
     checkpoint: Checkpoint | None = None
 
-    def record(self) -> Config:
-        """Identity of the parent as plain values, as stored in the checkpoints of its children.
+    @property
+    def reading(self) -> ReadingOptions | None:
+        """How the scans that the model learned from became images, if it was from scans."""
+        reading = (self.config.get("data") or {}).get("reading")
+        return construct("data.reading", ReadingOptions, reading) if reading else None
 
-        `weights` is the hash of its averaged weights; `first_pair` the first pair whose noise it
-        was not trained on; `pairs` the default folder of its pairs.
-        """
+    def record(self) -> Config:
+        """The `ParentRecord` of the checkpoints of its children, as plain values."""
         data = self.config.get("data", {})
         pairs = data.get("pairs") if data.get("name") == "pairs" else None
-        return {
-            "path": str(self.path),
-            "weights": self.checkpoint and weights_hash(self.checkpoint),
-            "step": self.step,
-            "stage": (self.config.get("stage") or {}).get("name", "rectify"),
-            "first_pair": pairs["first"] + pairs["num"] if pairs else 0,
-            "pairs": str(default_folder(self.path)),
-        }
+        record = ParentRecord(
+            path=str(self.path),
+            weights=weights_hash(self.checkpoint) if self.checkpoint else None,
+            step=self.step,
+            stage=(self.config.get("stage") or {}).get("name", "rectify"),
+            first_pair=pairs["first"] + pairs["num"] if pairs else 0,
+            pairs=str(default_folder(self.path)),
+        )
+        return asdict(record)
 
 
 def find_parent(name: "str | Path | Parent", backbone: Any = None) -> Parent:
@@ -95,7 +100,8 @@ def model_options(
         InputError: an unknown name or option, or one that contradicts the parent.
     """
     theirs = parent.config if parent else {}
-    if parent and "published" in theirs and theirs["data"]["reading"]["projection"] == "unfolding":
+    reading = parent.reading if parent else None
+    if parent and "published" in theirs and reading and reading.projection == "unfolding":
         raise InputError(
             f"{parent.path} was trained on unfolded scans, whose rings a new run's sensor does not "
             "have; "

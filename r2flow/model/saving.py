@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 from safetensors.torch import save
 
-from r2flow.base.config import learned
 from r2flow.base.errors import check
 from r2flow.base.files import write_file
 from r2flow.base.hashing import state_hash
 from r2flow.lidar.encoding import build_space
+from r2flow.model.config import learned
 from r2flow.model.parts import COMPILED, NOTES
 from r2flow.model.published import BACKBONE
 
@@ -37,7 +37,7 @@ def save_checkpoint(checkpoint: "Checkpoint", path: str | Path, half: bool = Fal
     float16.
 
     The bytes depend on the generator alone: of its config, the file stores the keys of
-    `r2flow.base.config.learned` and the names of plug-ins, without paths of this machine.
+    `r2flow.model.config.learned` and the names of plug-ins, without paths of this machine.
     """
     path = Path(path)
     check(path.suffix == ".safetensors", f"{path}: a checkpoint is written as .safetensors.")

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from r2flow.base.registry import Options
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.sets import ScanSet
 from r2flow.data.sources import ScanSource
@@ -27,6 +26,7 @@ from r2flow.reports.runs import read_runs
 from r2flow.reports.tables import Row, print_table, table
 from r2flow.samplers import FixedSteps
 
+REPORT = "compare.md"  # the last file of a report
 _SCANS = 32  # of each set that is compared
 _STAGES = {"rectify": "trained on scans", "reflow": "straightened", "distill": "distilled"}
 _GOAL = "training scans"
@@ -47,9 +47,8 @@ without scans
   r2flow sample street --num 16 --out scans                              # generate street scenes"""
 
 
-def link_label(name: str, config: Options) -> str:
+def link_label(name: str, stage: str) -> str:
     """Name of a link with what its stage does: 'rf2 (straightened)'."""
-    stage = config["stage"]["name"]
     return f"{name} ({_STAGES.get(stage, stage)})"
 
 
@@ -66,7 +65,7 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
     drawn = list(_drawn(makers, device))
     rows = [row for row, _ in drawn]
     captions = [row["title"] for row in rows]
-    labels = [link_label(one, model.config) for one, model in makers.items()]
+    labels = [link_label(one, model.config["stage"]["name"]) for one, model in makers.items()]
     if rows[-1]["scans"] == DEFAULT:
         labels.append(f"{DEFAULT} (a larger model, included)")
     about = f"{', '.join(labels)}. An evaluation runs the network once."

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean, stdev
 
-from r2flow.base.config import flatten, learned
+from r2flow.base.config import flatten
+from r2flow.model.config import learned
 from r2flow.reports.pages import Page
 from r2flow.reports.runs import ComparedRun
 from r2flow.reports.tables import Row, print_table, table

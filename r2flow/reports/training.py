@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from shlex import quote
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -67,9 +66,7 @@ def smooth(steps: ndarray, values: ndarray) -> Curve:
     return np.convolve(steps, kernel, "valid"), np.convolve(values, kernel, "valid")
 
 
-def finish(
-    run: Path, samples: Mapping[str, Any], seed: int, device: str, finished: bool, kept: bool
-) -> None:
+def finish(run: Path, num: int, seed: int, device: str, finished: bool, kept: bool) -> None:
     """Draw the loss curve and a few scans of a run; print its files and the commands that come
     next.
 
@@ -98,7 +95,6 @@ def finish(
             over = f" (means of {tenth} logged batches)" if tenth > 1 else " (noisy: of one batch)"
         print(f"{CURVES[name]}: {start}{values[-tenth:].mean():#.3g} at step {steps[-1]}{over}")
     print(f"\ncheckpoint    {checkpoint.path}")
-    num = samples["num"]
     if num == 0 or not checkpoint.generator.unconditional:
         return
     out = run / "samples"

@@ -4,9 +4,8 @@ import logging
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
 
 import lightning as L
 import torch
@@ -17,12 +16,13 @@ from lightning.pytorch.utilities import rank_zero_only
 from r2flow.base.config import key_of
 from r2flow.base.errors import InputError, naming, one_line
 from r2flow.base.plugins import loaded_plugins, made_with
-from r2flow.base.registry import Bound, Config, Natural, Options, Seed, construct, strict
+from r2flow.base.registry import Config, Options, construct
 from r2flow.callbacks import Progress, SamplePictures, build_callbacks
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.callbacks.loggers import LOGGERS, LearningRates
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions
+from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions, ReadingOptions
+from r2flow.model.config import RunConfig
 from r2flow.model.lineage import Parent, find_parent, model_options
 from r2flow.model.parts import MODEL, config_of
 from r2flow.runs.folder import check_run, read_config
@@ -41,54 +41,12 @@ _EXPECTED_WARNINGS = (
     ".*your dataloader is not resumable.*",  # it resumes by the trainer's step
 )
 
-_Named = Annotated[Options, Bound("a group with a name", lambda group: "name" in group)]
-_InRuns = Annotated[
-    str, Bound("a folder in runs", lambda name: name.strip("./") and ".." not in Path(name).parts)
-]
-
-
-@strict
-@dataclass(frozen=True)
-class SampleOptions:
-    """Samples drawn at the end of a run."""
-
-    num: Natural = 4
-
-
-@strict
-@dataclass(frozen=True)
-class RunConfig:
-    """Top-level keys of a run's config. Those of the groups are the options of the classes that
-    they are for.
-    """
-
-    stage: _Named  # class of `STAGES`, with its options
-    backbone: Options | None  # the following four: as in `Stage`
-    sensor: Options
-    encoding: Options
-    data: _Named  # `ScanDataModule`
-    trainer: Options  # Lightning's Trainer
-    callbacks: Mapping[str, Options | None]  # classes of `CALLBACKS`
-    samples: SampleOptions
-    run_dir: Annotated[str, Bound("a folder", lambda name: name.strip("/ "))]
-    seed: Seed
-    name: _InRuns | int | float = "run"
-    experiment: str | Sequence[str] | None = None
-    generator: Options | str | None = None
-    sampler: Options | None = None
-    few: Options | None = None
-    chain: Options | None = None
-    preview: str | None = None
-    loggers: Sequence[str] | None = None
-    plugins: Sequence[str] = ()
-    scans: Any = None  # identity of the scans, filled in by the run
-
 
 @dataclass
 class Run:
     """A run, ready to be fitted."""
 
-    config: Config  #: the complete config, including values from the parent and the data
+    config: RunConfig  #: the complete config, including values from the parent and the data
     stage: Stage  #: the LightningModule, with initial weights
     data: ScanDataModule  #: the DataModule; no scans have been read yet
     trainer: L.Trainer  #: Lightning's Trainer, with callbacks and loggers
@@ -96,10 +54,12 @@ class Run:
     @property
     def folder(self) -> Path:
         """Folder of config, checkpoints, logs and samples."""
-        return Path(self.config["run_dir"])
+        return Path(self.config.run_dir)
 
 
-def build(config: Options, asked: Sequence[str] = (), parent: Parent | None = None) -> Run:
+def build(
+    config: Options | RunConfig, asked: Sequence[str] = (), parent: Parent | None = None
+) -> Run:
     """Build the stage, the data and the Trainer of a config; scans are listed, not read.
 
     Args:
@@ -112,7 +72,7 @@ def build(config: Options, asked: Sequence[str] = (), parent: Parent | None = No
         InputError: an invalid value, an unknown name or option, a parent that is missing or not
             finished.
     """
-    run = construct("the config", RunConfig, config)
+    run = config if isinstance(config, RunConfig) else RunConfig.of(config)
     if run.chain or run.preview:
         raise InputError("this config is a chain of runs: train it by `r2flow train`.")
     with quiet(), made_with(read_config(run.run_dir) or {}, f"the run in {run.run_dir}"):
@@ -124,7 +84,7 @@ def build(config: Options, asked: Sequence[str] = (), parent: Parent | None = No
             parent = find_parent(named["path"] if isinstance(named, Mapping) else named)
         with made_with(parent.config if parent else {}, "the run that it starts from"):
             options = model_options(
-                _given(config, keys, parent),
+                _given(run, keys, parent),
                 parent,
                 stage_class.generator_name,
                 stage_class.needs_pairs,
@@ -143,33 +103,33 @@ def build(config: Options, asked: Sequence[str] = (), parent: Parent | None = No
         data.adopt(stage.item_format)
         trainer = _build_trainer(run, stage)
         data.share(trainer)  # refuses a batch that cannot be shared before there is a folder
-        complete = {**config, **config_of(stage.hparams, data.hparams, run.stage["name"])}
-        complete["plugins"] = list(run.plugins) or loaded_plugins()
-        return Run(complete, stage, data, trainer)
+        complete = config_of(stage.hparams, data.hparams, run.stage["name"])
+        complete["data"] = construct("data", DataOptions, complete["data"])
+        plugins = list(run.plugins) or loaded_plugins()
+        return Run(replace(run, **complete, plugins=plugins), stage, data, trainer)
 
 
-def check(config: Options, asked: Sequence[str] = (), parent: Parent | None = None) -> Config:
+def check(
+    config: Options | RunConfig, asked: Sequence[str] = (), parent: Parent | None = None
+) -> RunConfig:
     """Check a config by building its run; no files are written.
 
     The result is completed with values of its parent; `parent` is one that has not been trained
     yet.
     """
     run = build(config, asked, parent)
-    check_run(run.folder, run.config)
+    check_run(run.folder, run.config.plain())
     return run.config
 
 
-def _given(config: Options, keys: Sequence[str], parent: Parent | None) -> Config:
+def _given(run: RunConfig, keys: Sequence[str], parent: Parent | None) -> Config:
     """Options of the model; next to a parent's, only those of the command line."""
-    given = {group: config.get(group) for group in MODEL}
-    if parent is None:
-        return given
-    for group in ("backbone", "sensor", "encoding"):
-        if group not in keys:
-            options = config[group] or {}
-            asked_for = {key.split(".")[1] for key in keys if key.startswith(f"{group}.")}
-            own = {key: options[key] for key in options if key in asked_for}
-            given[group] = own or None
+    given: Config = {group: getattr(run, group) for group in MODEL}
+    if parent is not None:
+        for group in ("backbone", "sensor", "encoding"):
+            if group not in keys:
+                options = given[group] or {}
+                given[group] = {k: options[k] for k in options if f"{group}.{k}" in keys} or None
     return given
 
 
@@ -177,30 +137,28 @@ def _build_data(
     run: RunConfig, options: Options, keys: Sequence[str], parent: Parent | None
 ) -> ScanDataModule:
     """The DataModule of a config, for the model's sensor and encoding."""
-    data = dict(run.data)
-    chosen = construct("data", DataOptions, data)
-    _refuse_unread(data["name"], keys)
-    of_simulated = all(part.get("name") == SIMULATED for part in chosen.parts or [data])
+    data = run.data
+    _refuse_unread(data.name, keys)
+    of_simulated = all(part.get("name") == SIMULATED for part in data.parts or [vars(data)])
     drawer = parent
-    if data["name"] == PAIRS:
+    if data.name == PAIRS:
         if parent is None:
             raise InputError("data=pairs are drawn by a trained run: give stage.parent=RUN.")
-        drawer = find_parent(chosen.pairs.of) if chosen.pairs.of else parent
-    theirs = (drawer.config.get("data") or {}).get("reading") if drawer else None
-    if data["name"] == PAIRS:
-        data["reading"] = theirs
+        drawer = find_parent(data.pairs.of) if data.pairs.of else parent
+    theirs = drawer.reading if drawer else None
+    if data.name == PAIRS:
+        data = replace(data, reading=theirs)
     elif theirs and not of_simulated:  # the rays of simulated scans are given
-        data["reading"] = {
-            "projection": theirs["projection"],
-            "convention": theirs["convention"],
-            **chosen.chosen,
-        }
+        usual = {"projection": theirs.projection, "convention": theirs.convention}
+        data = replace(data, reading=ReadingOptions(**{**usual, **data.chosen}))
     encoding = dict(options["encoding"])
     if parent is None:
         encoding["reflectance"] = run.encoding.get("reflectance", True)  # `auto` looks at the scans
     if "encoding.levels" not in keys:
         encoding["levels"] = None  # those of the scans, else of the parent
-    module = ScanDataModule(**data, sensor=options["sensor"], encoding=encoding, seed=run.seed)
+    module = ScanDataModule(
+        **vars(data), sensor=options["sensor"], encoding=encoding, seed=run.seed
+    )
     if module.encoding.levels is None:
         module.encoding.levels = options["encoding"].get("levels")
     if parent and drawer and module.pairs:
@@ -227,36 +185,44 @@ def _refuse_unread(name: str, keys: Sequence[str]) -> None:
 
 
 def _build_trainer(run: RunConfig, stage: Stage) -> L.Trainer:
-    options = dict(run.trainer)
-    if options["accelerator"] == "auto" and not torch.cuda.is_available():
-        options["accelerator"] = "cpu"  # Lightning would choose Apple's GPU, which lacks float64
+    options = run.trainer
+    if options.accelerator == "auto" and not torch.cuda.is_available():
+        options = replace(options, accelerator="cpu")  # Apple's GPU lacks float64
+    if options.accelerator == "cpu" and options.precision in (16, "16", "16-mixed"):
+        raise InputError("trainer.precision=16-mixed needs a GPU: give bf16-mixed or 32-true.")
     if not stage.automatic_optimization:  # Lightning leaves these two to the stage
-        if options["accumulate_grad_batches"] != 1:
+        if options.accumulate_grad_batches != 1:
             name = run.stage["name"]
             raise InputError(
                 f"stage={name} takes its own optimiser steps: trainer.accumulate_grad_batches must "
                 "be 1."
             )
-        stage.gradient_clip_val = options["gradient_clip_val"]
-        options["gradient_clip_val"] = None
-    interval = options["val_check_interval"]
+        stage.gradient_clip_val = options.gradient_clip_val
+        options = replace(options, gradient_clip_val=None)
+    interval = options.val_check_interval
     if interval == 0:
         raise InputError(
             "trainer.val_check_interval must be above 0; "
             "trainer.limit_val_batches=0 leaves validation out."
         )
-    if isinstance(interval, int) and options["check_val_every_n_epoch"] is None:
-        if options["max_steps"] > 0:  # a short run is validated once, at its end
-            interval = min(interval, options["max_steps"])
-        options["val_check_interval"] = interval * options["accumulate_grad_batches"]
-    callbacks = _callbacks(run, stage, options)
+    if isinstance(interval, int) and options.check_val_every_n_epoch is None:
+        if options.max_steps > 0:  # a short run is validated once, at its end
+            interval = min(interval, options.max_steps)
+        parts = options.accumulate_grad_batches
+        options = replace(options, val_check_interval=interval * parts)
+    callbacks = _callbacks(run, stage)
+    options = replace(  # without such a callback, Lightning would add its own
+        options,
+        enable_checkpointing=any(isinstance(one, Checkpoint) for one in callbacks),
+        enable_progress_bar=any(isinstance(one, ProgressBar) for one in callbacks),
+    )
     loggers = [LOGGERS[name](Path(run.run_dir)) for name in run.loggers or ()]
     if loggers:
         callbacks.insert(0, LearningRates("step"))
     try:
         with quiet():
             trainer = L.Trainer(
-                **options, callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()]
+                **vars(options), callbacks=callbacks, logger=loggers, plugins=[AtomicCheckpointIO()]
             )
         rank_zero_only.rank = trainer.global_rank  # type: ignore[attr-defined] # not SLURM_PROCID of a task alone
         if environment := getattr(trainer.strategy, "cluster_environment", None):
@@ -278,20 +244,19 @@ def _build_trainer(run: RunConfig, stage: Stage) -> L.Trainer:
     return trainer
 
 
-def _callbacks(run: RunConfig, stage: Stage, options: Config) -> list[L.Callback]:
-    """The callbacks of a config; `options` of the Trainer may leave some out."""
+def _callbacks(run: RunConfig, stage: Stage) -> list[L.Callback]:
+    """The callbacks of a config, without those that options of the Trainer leave out."""
     callbacks: list[L.Callback] = [Progress()]
-    if not options["fast_dev_run"]:
+    if not run.trainer.fast_dev_run:
         callbacks = build_callbacks(run.callbacks)
     for callback in callbacks:
         if isinstance(callback, SamplePictures):
             with naming("callbacks.pictures"):
                 callback.check(stage.generator)  # before there is a folder
-    for key, kind in (("enable_checkpointing", Checkpoint), ("enable_progress_bar", ProgressBar)):
-        if not options[key]:
-            callbacks = [callback for callback in callbacks if not isinstance(callback, kind)]
-        # Without one, Lightning would add its own.
-        options[key] = any(isinstance(callback, kind) for callback in callbacks)
+    if not run.trainer.enable_checkpointing:
+        callbacks = [one for one in callbacks if not isinstance(one, Checkpoint)]
+    if not run.trainer.enable_progress_bar:
+        callbacks = [one for one in callbacks if not isinstance(one, ProgressBar)]
     return callbacks
 
 

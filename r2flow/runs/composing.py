@@ -2,7 +2,7 @@
 
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from r2flow.base.config import key_of, override
 from r2flow.base.errors import InputError
-from r2flow.base.registry import Config, did_you_mean, options_of
+from r2flow.base.registry import Config, Options, did_you_mean, options_of
 
 T = TypeVar("T")
 
@@ -44,13 +44,21 @@ REGISTRIES = {
     "sensor": ("r2flow.lidar.sensors", "SENSORS", ()),
 }
 
+GROUPS = (*REGISTRIES, "encoding", "trainer", "callbacks", "experiment", "size")
 
-def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -> Config:
+
+def compose(
+    overrides: Sequence[str] = (),
+    folders: Sequence[str | Path] = (),
+    keys: Options | None = None,
+) -> Config:
     """Compose the config of a command line, as plain dicts: `compose(["data=kitti_raw",
     "data.root=FOLDER"])`.
 
     Args:
         folders: Additional config folders, as in `--config-dir`.
+        keys: Values between those of the experiment and the overrides; names of a group's file
+            choose that.
 
     Raises:
         InputError: what Hydra, OmegaConf or YAML says of an unknown key or choice, or of a damaged
@@ -59,12 +67,25 @@ def compose(overrides: Sequence[str] = (), folders: Sequence[str | Path] = ()) -
     search = [f"file://{Path(folder).resolve()}" for folder in folders]
     with _hydra():
         try:
-            given = [*as_hydra_takes(overrides), override("hydra.searchpath", search)]
+            given = [*(_with_keys(keys) if keys else ()), *as_hydra_takes(overrides)]
+            given.append(override("hydra.searchpath", search))
             config = with_choices(partial(hydra.compose, "train", given, return_hydra_config=True))
             HydraConfig.instance().set_config(config)
             return plain(config)
         except WRONG as error:
             raise InputError(in_one_line(error)) from None
+
+
+def _with_keys(keys: Options) -> list[str]:
+    """The choices among a link's keys; its values become a config of Hydra's."""
+    values = {key: dict(one) if isinstance(one, Mapping) else one for key, one in keys.items()}
+    named = [group for group in GROUPS if isinstance(values.get(group), str)]
+    chosen = [override(group, values.pop(group)) for group in named]
+    if "name" in values.get("stage", ()):
+        chosen.append(override("stage", values["stage"].pop("name")))
+    values.pop("experiment", None)  # null
+    ConfigStore.instance().store("keys", values, group="link", package="_global_")
+    return [*as_hydra_takes(chosen), "+link@_global_=keys"]
 
 
 @contextmanager

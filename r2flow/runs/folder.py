@@ -3,7 +3,7 @@
 import logging
 import os
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,11 @@ from typing import Any
 import yaml
 from filelock import FileLock, Timeout
 
-from r2flow.base.config import at_most_three, check_tree, differences, is_free
+from r2flow.base.config import at_most_three, check_tree, differences
 from r2flow.base.errors import InputError, check
 from r2flow.base.files import write_file
 from r2flow.base.registry import Config, Options
+from r2flow.model.config import contradictions, is_found
 from r2flow.model.parts import HYPER, NOTES
 from r2flow.model.paths import FOLDER, checkpoints_of, step_of
 from r2flow.model.tensor_files import read_checkpoint
@@ -22,10 +23,6 @@ from r2flow.model.tensor_files import read_checkpoint
 log = logging.getLogger(__name__)
 
 CONFIG = "config.yaml"
-
-
-def contradictions(old: Options, new: Options) -> list[str]:
-    return [text for key, text in differences(old, new).items() if not is_free(key)]
 
 
 @contextmanager
@@ -103,8 +100,9 @@ def open_run(run: str | Path, config: Options, locked: bool = True) -> Path | No
         )
     if old is not None and last is not None:
         _refuse_another_config(run, contradictions(old, config))
-        other = differences(old, config)
-        samplers = [other[key] for key in other if key.startswith("sampler.")]
+        samplers = [
+            text for key, text in differences(old, config).items() if key.startswith("sampler.")
+        ]
         if samplers and has_ended(run, last):
             raise InputError(
                 f"{run} is finished and keeps its sampler: {'; '.join(samplers)}. Keep the "
@@ -127,26 +125,22 @@ def check_run(run: str | Path, config: Options) -> None:
     old = read_config(run)
     if old is None or not checkpoints_of(run):
         return
-    later = (
-        "scans",
-        "stage.parent",
-        "encoding.reflectance",
-        "encoding.levels",
-        "data.pairs.parent",
-    )
-    differing = [text for text in contradictions(old, config) if not text.startswith(later)]
-    _refuse_another_config(run, differing, alone=False)
+    other = contradictions(old, config)
+    asked = {key: text for key, text in other.items() if not is_found(key)}
+    _refuse_another_config(run, asked, alone=False)
 
 
-def _refuse_another_config(run: str | Path, differing: Sequence[str], alone: bool = True) -> None:
+def _refuse_another_config(
+    run: str | Path, differing: Mapping[str, str], alone: bool = True
+) -> None:
     if differing:
         more_steps = ""
-        if alone and all(text.startswith("trainer.max_steps=") for text in differing):
+        if alone and differing.keys() == {"trainer.max_steps"}:
             # Not the folder: the run may not be finished.
             last = next(_readable(run), run)
             more_steps = f", stage.parent={last} name=OTHER to learn on from its weights"
         raise InputError(
-            f"{run} holds a run of another config: {at_most_three(differing)}. "
+            f"{run} holds a run of another config: {at_most_three([*differing.values()])}. "
             f"Give the same settings and scans to resume it{more_steps}, or name=OTHER for a new "
             "one."
         )

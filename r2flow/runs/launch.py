@@ -13,7 +13,7 @@ from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import hydra
 from hydra._internal.utils import get_args_parser
@@ -25,7 +25,7 @@ from omegaconf import DictConfig
 from r2flow.base.config import key_of, override
 from r2flow.base.errors import InputError
 from r2flow.base.plugins import load_plugins
-from r2flow.base.registry import Config, Options
+from r2flow.base.registry import Options
 from r2flow.base.signals import LATER, STOPPING, Stopped, code_of, handling_signals, run_process
 from r2flow.runs.composing import (
     CONF,
@@ -37,6 +37,9 @@ from r2flow.runs.composing import (
     register_resolver,
     with_choices,
 )
+
+if TYPE_CHECKING:
+    from r2flow.model.config import RunConfig, TrainerOptions
 
 
 class _JobEnded(RuntimeError):
@@ -145,12 +148,14 @@ def _run_hydra(
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 return _sweep_job(command, given)
             settings = plain(config)
-            if settings["chain"]:
-                codes.append(_chain(settings, given, folders))
-            else:  # imported here, so that errors in the config are reported before torch is loaded
-                from r2flow.training import build, fit
+            # imported here, so that Hydra's errors are reported before torch is loaded
+            from r2flow.training import RunConfig, build, fit
 
-                codes.append(0 if fit(build(settings, given)).finished else LATER)
+            run = RunConfig.of(settings)
+            if run.chain is not None:
+                codes.append(_chain(run, run.chain, given, folders))
+            else:
+                codes.append(0 if fit(build(run, given)).finished else LATER)
         except Exception as error:
             if os.getpid() != launcher:  # a remote launcher sees only exceptions, after all jobs
                 raise
@@ -189,31 +194,30 @@ def _sweep_job(command: Sequence[str], given: Sequence[str]) -> None:
         raise _JobEnded(code, str(run_dir))
 
 
-def _chain(settings: Config, given: Sequence[str], folders: Sequence[str]) -> int:
+def _chain(run: "RunConfig", chain: Options, given: Sequence[str], folders: Sequence[str]) -> int:
+    from r2flow.reports.chain import REPORT, report_chain
     from r2flow.runs.chain import check_links, links_of, train_links
     from r2flow.runs.folder import has_ended
 
-    if settings["trainer"]["fast_dev_run"]:
+    if run.trainer.fast_dev_run:
         raise InputError(
             "a chain's links start from earlier runs, and trainer.fast_dev_run leaves none."
         )
-    folder = Path(settings["run_dir"])
-    links = links_of(settings["chain"], folder, given, folders)
-    finished = all(has_ended(link.run_dir) for link in links)
+    folder = Path(run.run_dir)
+    links = links_of(chain, folder, given, folders)
+    finished = all(has_ended(link.config.run_dir) for link in links)
     if not finished:
-        check_links(links, folders)
-    if settings["preview"]:  # scans of a trained model, while the chain trains
-        _draw_preview(settings["preview"], folder / "preview")
-    out = folder / "report"
-    if code := train_links(links, folders):
+        check_links(links)
+    if run.preview:  # scans of a trained model, while the chain trains
+        _draw_preview(run.preview, folder / "preview")
+    if code := train_links(links):
         return code
-    if finished and out.is_dir():
-        print(f"report: finished before, {out / 'compare.md'}")
+    out = folder / "report"
+    if finished and (out / REPORT).is_file():
+        print(f"report: finished before, {out / REPORT}")
     elif int(os.environ.get("LOCAL_RANK", "0")) == 0:
-        from r2flow.reports.chain import report_chain
-
-        runs = {link.name: link.run_dir for link in links}
-        report_chain(runs, out, _report_device(settings["trainer"]))
+        runs = {link.name: Path(link.config.run_dir) for link in links}
+        report_chain(runs, out, _report_device(run.trainer))
     return 0
 
 
@@ -228,10 +232,10 @@ def _draw_preview(model: str, out: Path) -> None:
     print(f"while you wait: scans of the included model {model}, {picture}", flush=True)
 
 
-def _report_device(trainer: Options) -> str:
+def _report_device(trainer: "TrainerOptions") -> str:
     import torch
 
-    if not torch.cuda.is_available() or trainer["accelerator"] == "cpu":
+    if not torch.cuda.is_available() or trainer.accelerator == "cpu":
         return "cpu"
-    cards = trainer["devices"]
+    cards = trainer.devices
     return f"cuda:{cards[0]}" if isinstance(cards, list) else "cuda"

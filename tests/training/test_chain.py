@@ -12,6 +12,7 @@ import yaml
 from r2flow.base.errors import InputError
 from r2flow.base.signals import LATER
 from r2flow.data.datamodule import ScanDataModule
+from r2flow.data.options import PAIRS
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.paths import checkpoints_of
 from r2flow.model.saving import weights_hash
@@ -266,31 +267,27 @@ def test_two_devices_make_the_pairs_that_one_makes(chained: tuple[Path, str], tm
         ).read_bytes()
 
 
-ALL_LINKS = ("data.batch_size=2", "data.validation.share=0.1", "+trainer.x=1")
-OF_SCANS = (
-    "data.augment.flip=true",
-    "data.a_key_of_tomorrow=1",
-    "data.validation.data.root=x",
-    "sensor=vlp16",
-)
+ALL_LINKS = ("data.batch_size=2", "data.validation.share=0.1", "trainer.max_steps=7", "seed=3")
+OF_SCANS = ("data.augment.flip=true", "sensor=vlp16", "data=folder", "data.root='a b'")
 
 
 def test_links_take_what_concerns_them_and_at_last_what_is_given_to_them_alone():
     chain = {
-        "rf1": {"experiment": None, "trainer": {"max_steps": 5}},
+        "rf1": {"experiment": None, "trainer": {"max_steps": 5}, "samples": {"num": 0}},
         "rf2": {"experiment": "reflow", "parent": "rf1", "stage": {"loss": "mse"}},
     }
-    given = ["experiment=demo", "name=x", "chain.rf1.trainer.max_steps=5", "data=folder", "data.root='a b'", "seed=3",
-             *OF_SCANS, "data.pairs.num=9", *ALL_LINKS, "backbone.depths=[1]", "+chain.rf2.seed=2"]  # fmt: skip
-    first, second = links_of(chain, "runs/x", given)
-    assert first.overrides == (
-        "trainer.max_steps=5", "data=folder", "data.root='a b'", "seed=3", *OF_SCANS, *ALL_LINKS,
-        "backbone.depths=[1]", "trainer.max_steps=5", "run_dir=runs/x/rf1",
-    )  # fmt: skip
-    assert second.overrides == (
-        "experiment=reflow", "stage.loss=mse", "stage.parent=runs/x/rf1", "seed=3", "data.pairs.num=9",
-        *ALL_LINKS, "seed=2", "run_dir=runs/x/rf2",
-    )  # fmt: skip
+    given = ["experiment=demo", "name=x", "chain.rf1.trainer.max_steps=9", *OF_SCANS, "data.pairs.num=9",
+             *ALL_LINKS, "backbone.depths=[1]", "+chain.rf2.seed=2"]  # fmt: skip
+    first, second = (link.config for link in links_of(chain, "runs/x", given))
+    assert (first.data.name, first.data.root, first.data.augment["flip"]) == ("folder", "a b", True)
+    assert (first.trainer.max_steps, first.samples.num, first.seed) == (9, 0, 3)
+    assert (first.sensor["name"], first.backbone["depths"]) == ("vlp16", [1])
+    assert (first.run_dir, second.run_dir) == ("runs/x/rf1", "runs/x/rf2")
+    assert (second.data.name, second.data.root, second.data.augment["flip"]) == (PAIRS, None, False)
+    assert (second.data.pairs.num, first.data.pairs.num) == (9, 1000)
+    assert (second.trainer.max_steps, second.data.batch_size, second.seed) == (7, 2, 2)
+    assert second.stage["parent"] == "runs/x/rf1"
+    assert (second.stage["loss"], second.sensor["name"]) == ("mse", "hdl64e")
 
 
 def test_every_link_of_the_paper_s_chain_is_built_before_the_first_one_runs(
@@ -307,7 +304,7 @@ def test_every_link_of_the_paper_s_chain_is_built_before_the_first_one_runs(
     assert in_process(tmp_path, command, check=False).returncode == LATER
     (first,) = ran  # the later ones have been built, and are not refused for the flip
     assert first.data.augment.flip
-    assert first.config["trainer"] == {
+    assert first.config.plain()["trainer"] == {
         **compose(["experiment=r2flow_1rf"])["trainer"],
         "accelerator": "cpu",
         "default_root_dir": "runs/r2flow/rf1",
@@ -333,20 +330,20 @@ def test_scans_in_files_take_the_place_of_a_chain_s_simulated_scenes(
     )
     in_process(tmp_path, command, check=False)
     assert len(ran) == 1  # of both
-    (link,) = links_of({"rf1": {"data": {"scenes": 9}}}, "runs", ["data=simulated"])
-    assert link.overrides[:2] == ("data.scenes=9", "data=simulated")
+    nine = {"rf1": {"data": {"scenes": 9}}}
+    (link,) = links_of(nine, "runs", ["data=simulated"])
+    assert (link.config.data.scenes, "data.scenes" in link.asked) == (9, True)
     more = {
         "more": {"parent": "rf1", "data": {"scenes": 9}},
         "rf2": {"experiment": "reflow", "parent": "more"},
     }
-    assert (
-        links_of({"rf1": {"data": {"scenes": 9}}}, "runs", ["data=mixed"])[0].overrides[0]
-        == "data=mixed"
-    )
+    usual = compose()["data"]["scenes"]
+    assert links_of(nine, "runs", ["data=mixed"])[0].config.data.scenes == usual
     links = links_of({"rf1": {"data": {"scenes": 8}}, **more}, "runs", ["data=folder"])
     # rf2 learns from pairs
-    assert ["data=folder" in link.overrides for link in links] == [True, True, False]
-    assert not any(text.startswith("data.scenes") for link in links for text in link.overrides)
+    assert [link.config.data.name for link in links] == ["folder", "folder", PAIRS]
+    assert [link.config.data.scenes for link in links] == [usual] * 3
+    assert not any("data.scenes" in link.asked for link in links)
 
 
 def test_a_chain_s_report_draws_what_each_system_can(chained: tuple[Path, str], tmp_path: Path):
@@ -378,9 +375,8 @@ def test_a_chain_s_report_draws_what_each_system_can(chained: tuple[Path, str], 
 def test_a_chain_can_begin_at_a_flow_that_is_there_with_a_stage_of_its_own_options():
     chain = {"td4": {"stage": {"name": "distill", "steps": 4, "parent": "runs/old"}}}
     (link,) = links_of(chain, "runs/x", ["data.pairs.num=5", "data.root=scans"])
-    assert compose(link.overrides)["stage"]["steps"] == 4
-    assert "data.pairs.num=5" in link.overrides
-    assert "data.root=scans" not in link.overrides
+    assert (link.config.stage["name"], link.config.stage["steps"]) == ("distill", 4)
+    assert (link.config.data.pairs.num, link.config.data.root) == (5, None)
 
 
 @pytest.mark.parametrize(

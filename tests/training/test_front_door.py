@@ -2,19 +2,24 @@
 written.
 """
 
+import math
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 
+from r2flow.base.config import Free
+from r2flow.base.errors import InputError, one_line
 from r2flow.base.files import write_file
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.generators import build_generator
 from r2flow.lidar.sensors import SENSORS, build_sensor, write_sensor
+from r2flow.model.config import RunConfig, TrainerOptions
 from r2flow.runs.folder import CONFIG, RESUMED, open_run, read_config
 from r2flow.training import build, check, compose
 from tests.conftest import refused
@@ -41,6 +46,15 @@ REFUSED = {
     "backbone.window=[2,9]": "window.0: must be odd, found 2",
     "data.scans={name: simulated}": "data.scans needs data=pairs, found data=simulated",
     "data.reading.projection=unfolding": "leave data.reading out",
+    "trainer.max_steps=abc": "trainer: max_steps: input should be a valid integer",
+    "trainer.max_steps=null": "trainer: max_steps: input should be a valid integer, found None",
+    "trainer.max_steps=0": "trainer: max_steps: must be -1 or above 0, found 0",
+    "trainer.max_steps=nan": "trainer: max_steps: input should be a finite number",
+    "trainer.accumulate_grad_batches=0": "trainer: accumulate_grad_batches: input should be greater",
+    "trainer.gradient_clip_val=nan": "trainer: gradient_clip_val: input should be a finite number",
+    "trainer.precision=16-mixed": "16-mixed needs a GPU: give bf16-mixed or 32-true",
+    "seed=true": "seed: must be a number, found True",
+    "chain=3": "chain: input should be a valid dictionary, found 3",
     "trainer.val_check_interval=0": "val_check_interval must be above 0",
     "stage.time={name: u_shaped, a: 800}": "a: must be above 0 and at most 80, found 800",
     "sampler.name=mmps": "completes scans: give it to r2flow complete by --sampler",
@@ -84,6 +98,63 @@ REFUSED = {
     "data.augment.roll=true": "data.augment.roll | backbone.position=learnable | backbone.position=none",
     "data.validation.data={name: mixed}": "needs the name of a data set",
 }
+
+
+# Keys of the Trainer whose values are text, among others; in which zero means something; in which
+# -1 does; of yes and no.
+TEXT = {"accelerator", "strategy", "devices", "precision", "max_time", "val_check_interval", "profiler",
+        "default_root_dir"}  # fmt: skip
+ZERO = {"fast_dev_run", "limit_val_batches", "overfit_batches", "val_check_interval", "num_sanity_val_steps",
+        "log_every_n_steps", "gradient_clip_val", "reload_dataloaders_every_n_epochs", "precision"}  # fmt: skip
+LESS = {"max_epochs", "max_steps", "num_sanity_val_steps", "devices", "precision"}
+SWITCHES = {
+    one.name for one in fields(TrainerOptions) if one.type is bool or one.type == Free[bool]
+}
+SWITCHES |= {"deterministic", "benchmark"}
+
+
+def refusal(action: Callable[[], object]) -> str:
+    """What an error says, in one line; empty if there is none."""
+    try:
+        action()
+    except InputError as error:
+        return one_line(str(error))
+    return ""
+
+
+@pytest.mark.parametrize("key", [one.name for one in fields(TrainerOptions)])
+def test_every_key_of_the_trainer_has_a_type_and_bounds(key: str):
+    config = compose(["trainer.accelerator=cpu"])
+
+    def taken(value: object) -> bool:
+        said = refusal(
+            lambda: RunConfig.of({**config, "trainer": {**config["trainer"], key: value}})
+        )
+        assert said == "" or said.startswith(f"trainer: {key}")
+        return said == ""
+
+    assert taken(config["trainer"][key])
+    for wrong in (math.nan, math.inf, -math.inf, [["a"]], {"a": {"b": 1}}):
+        assert not taken(wrong), wrong
+    for huge in (10**30, 1e30):  # no gradient is as long
+        assert taken(huge) == (key == "gradient_clip_val"), huge
+    assert taken("abc") == (key in TEXT)
+    assert taken(0) == (key in ZERO | SWITCHES)
+    assert taken(-1) == (key in LESS)
+    assert taken(-7) == (key == "precision")  # Lightning refuses it
+    assert taken(True) == (key in SWITCHES | {"fast_dev_run"})
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [*((key, 0) for key in sorted(ZERO)), *((key, "abc") for key in sorted(TEXT))],
+)
+def test_what_only_lightning_knows_is_refused_in_one_line(key: str, value: object):
+    config = compose(["trainer.accelerator=cpu"])
+    said = refusal(lambda: build({**config, "trainer": {**config["trainer"], key: value}}))
+    assert said == "" or "trainer" in said
+    if value == "abc":
+        assert (said == "") == (key == "default_root_dir")
 
 
 @pytest.mark.parametrize(("arguments", "words"), REFUSED.items(), ids=REFUSED)
@@ -142,7 +213,7 @@ def test_a_folder_of_configs_may_have_any_name(tmp_path: Path):
 
 def test_a_run_learns_the_levels_of_its_scans_unless_told(tmp_path: Path):
     asked = ["data.scenes=2", "backbone=hdit_tiny", f"run_dir={tmp_path}"]
-    assert build(compose(asked), asked).config["encoding"]["levels"] == 100
+    assert build(compose(asked), asked).config.encoding["levels"] == 100
     # none drawn
     asked += [
         "encoding.levels=50.0",
@@ -150,7 +221,7 @@ def test_a_run_learns_the_levels_of_its_scans_unless_told(tmp_path: Path):
         "+callbacks.pictures={every: 0, steps: 3}",
     ]
     run = build(compose(asked), asked)
-    assert run.config["encoding"]["levels"] == run.stage.generator.space.encoding.levels == 50
+    assert run.config.encoding["levels"] == run.stage.generator.space.encoding.levels == 50
 
 
 def test_scans_in_files_take_the_place_of_an_experiments_simulated_scenes(
@@ -205,7 +276,7 @@ def test_a_named_choice_has_options_of_its_own():
 
 def test_a_generator_without_options_is_given_by_its_name():
     named = check(compose(["generator=rectified_flow"]))
-    assert named["generator"] == {"name": "rectified_flow"} == check(compose([]))["generator"]
+    assert named.generator == {"name": "rectified_flow"} == check(compose([])).generator
 
 
 @pytest.mark.parametrize(

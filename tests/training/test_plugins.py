@@ -50,8 +50,10 @@ def test_a_forgotten_backbone_is_named_by_compare_and_by_a_file(tmp_path: Path):
     plugins._loaded.clear()  # of other tests of this process
     load_plugins([str(deep)])
     run = build(compose(["backbone=deep", f"run_dir={tmp_path}/run"]))
-    open_run(run.folder, run.config)
-    save_checkpoint(Checkpoint(run.stage.generator, run.config), tmp_path / "deep.safetensors")
+    open_run(run.folder, run.config.plain())
+    save_checkpoint(
+        Checkpoint(run.stage.generator, run.config.plain()), tmp_path / "deep.safetensors"
+    )
     plugins._loaded.clear()
     del BACKBONES._entries["deep"]
     with pytest.raises(InputError, match=f"no backbone named 'deep'; .*: give --plugin {deep}"):

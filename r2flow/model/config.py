@@ -1,0 +1,218 @@
+"""The config of a run: one tree of typed values, whose annotations are the rules of its keys."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from r2flow.base.config import (
+    Found,
+    Free,
+    Rule,
+    differences,
+    is_groups,
+    key_of,
+    rules_in,
+    rules_of,
+)
+from r2flow.base.errors import InputError
+from r2flow.base.registry import (
+    Bound,
+    Config,
+    Count,
+    Integer,
+    Natural,
+    NonNegative,
+    Number,
+    Options,
+    Seed,
+    Share,
+    construct,
+    strict,
+)
+from r2flow.data.options import DataOptions
+
+_Named = Annotated[Options, Bound("a group with a name", lambda group: "name" in group)]
+_InRuns = Annotated[
+    str, Bound("a folder in runs", lambda name: name.strip("./") and ".." not in Path(name).parts)
+]
+_End = Annotated[Integer, Bound("-1 or above 0", lambda end: end == -1 or end > 0)]
+_Batches = Count | Annotated[Number, Field(gt=0, le=1)]  # a number of them, or a share
+_Time = str | Mapping[str, Natural]
+_Devices = Annotated[_End, Field(le=10**4)]
+_OwnOfALink = Rule(free=True, links="none")
+_OfScans = Rule(links="scans")
+
+
+@strict
+@dataclass(frozen=True)
+class TrainerOptions:
+    """Arguments of Lightning's Trainer for training; their defaults are in conf/trainer."""
+
+    accelerator: Free[str]
+    strategy: Free[str]
+    devices: Free[_Devices | str | Sequence[Natural]]
+    num_nodes: Free[Annotated[Count, Field(le=10**4)]]
+    precision: Free[Integer | str]
+    fast_dev_run: bool | Natural
+    max_epochs: _End | None
+    min_epochs: Count | None
+    max_steps: _End
+    min_steps: Count | None
+    max_time: Free[_Time | None]
+    limit_train_batches: _Batches | None
+    limit_val_batches: Natural | Share | None
+    overfit_batches: Natural | Share
+    val_check_interval: Free[Natural | Share | _Time | None]
+    check_val_every_n_epoch: Count | None
+    num_sanity_val_steps: Annotated[Integer, Field(ge=-1)]
+    log_every_n_steps: Free[Natural]
+    enable_checkpointing: bool
+    enable_progress_bar: Free[bool]
+    enable_model_summary: bool
+    accumulate_grad_batches: Count
+    gradient_clip_val: NonNegative | None
+    gradient_clip_algorithm: Literal["norm", "value"] | None
+    deterministic: bool | Literal["warn"] | None
+    benchmark: bool | None
+    inference_mode: bool
+    use_distributed_sampler: bool
+    profiler: Free[str | None]
+    detect_anomaly: bool
+    barebones: bool
+    sync_batchnorm: bool
+    reload_dataloaders_every_n_epochs: Natural
+    default_root_dir: Free[str | None]
+    enable_autolog_hparams: bool
+
+
+@strict
+@dataclass(frozen=True)
+class SampleOptions:
+    """Samples drawn at the end of a run."""
+
+    num: Natural = 4
+
+
+@dataclass(frozen=True)
+class ParentRecord:
+    """Identity of the model that a run starts from, as its checkpoints store it."""
+
+    path: Free[str]
+    weights: str | None  # hash of the averaged weights; None: not trained yet
+    step: int
+    stage: str
+    first_pair: int  # the first pair whose noise the model was not trained on
+    pairs: Free[str]  # default folder of its pairs
+
+
+@dataclass(frozen=True)
+class _StageKeys:
+    parent: Found[ParentRecord]
+
+
+@dataclass(frozen=True)
+class _EncodingKeys:
+    reflectance: Found[Any]
+    levels: Found[Any]
+
+
+@dataclass(frozen=True)
+class _CallbackKeys:
+    """Callbacks that do not change the weights."""
+
+    reflow_pairs: Free[Any]
+    pictures: Free[Any]
+    curvature: Free[Any]
+    guard: Free[Any]
+    requeue: Free[Any]
+    checkpoint: Free[Any]
+    progress: Free[Any]
+
+
+@strict
+@dataclass(frozen=True)
+class RunConfig:
+    """All keys of a run. Options of a registry's class are checked by that class."""
+
+    stage: Annotated[_Named, _StageKeys]  # class of `STAGES`, with its options
+    backbone: Annotated[Options | None, _OfScans]  # the following four: as in `Stage`
+    sensor: Annotated[Options, _OfScans]
+    encoding: Annotated[Options, _EncodingKeys, _OfScans]
+    data: Annotated[DataOptions, _OfScans]
+    trainer: TrainerOptions
+    callbacks: Annotated[Mapping[str, Options | None], _CallbackKeys]  # classes of `CALLBACKS`
+    samples: Free[SampleOptions]
+    run_dir: Annotated[str, Bound("a folder", lambda name: name.strip("/ ")), _OwnOfALink]
+    seed: Seed
+    name: Annotated[_InRuns | int | float, _OwnOfALink] = "run"
+    experiment: Annotated[str | Sequence[str] | None, _OwnOfALink] = None
+    generator: Annotated[Options | str | None, _OfScans] = None
+    sampler: Free[Options | None] = None
+    few: Free[Options | None] = None
+    chain: Annotated[Mapping[Any, Any] | None, _OwnOfALink] = None  # links by name
+    preview: Annotated[str | None, _OwnOfALink] = None
+    loggers: Free[Sequence[str] | None] = None
+    plugins: Free[Sequence[str]] = ()
+    scans: Found[Any] = None  # identity of the scans
+
+    @classmethod
+    def of(cls, config: Options) -> "RunConfig":
+        """The config of composed keys.
+
+        Raises:
+            InputError: an unknown key, a missing one, or a value out of its bounds.
+        """
+        groups = {"trainer": TrainerOptions, "data": DataOptions}
+        data = config.get("data")
+        if isinstance(data, Mapping) and "name" not in data:
+            raise InputError(f"data: must be a group with a name, found {data!r}.")
+        typed = {
+            key: construct(key, kind, config[key])
+            for key, kind in groups.items()
+            if isinstance(config.get(key), Mapping)
+        }
+        return construct("the config", cls, {**config, **typed})
+
+    def plain(self) -> Config:
+        """The config as nested dictionaries, as in its file."""
+        return asdict(self)
+
+
+def is_free(key: str) -> bool:
+    """Whether a key may differ on resumption."""
+    return any(rule.free for rule in rules_of(RunConfig, key))
+
+
+def is_found(key: str) -> bool:
+    """Whether a run fills a key in."""
+    return any(rule.found for rule in rules_of(RunConfig, key))
+
+
+def links_of_key(override: str) -> str:
+    """The links of a chain that take an override from its command line: see `Rule.links`."""
+    key = key_of(override)
+    if key.partition(".")[0] not in rules_in(RunConfig):  # a choice of the command, as `size`
+        return "none"
+    return next((rule.links for rule in rules_of(RunConfig, key) if rule.links), "all")
+
+
+def contradictions(old: Options, new: Options) -> dict[str, str]:
+    """Keys in which a run and another config that would resume it differ, with both values."""
+    return {key: text for key, text in differences(old, new).items() if not is_free(key)}
+
+
+def learned(config: Options, prefix: str = "") -> Config:
+    """A config without its free keys: the settings that affect the result."""
+    fixed: Config = {}
+    for key, value in config.items():
+        if isinstance(value, Mapping) and value:
+            if inner := learned(value, f"{prefix}{key}."):
+                fixed[key] = inner
+        elif not is_free(f"{prefix}{key}"):
+            fixed[key] = value
+            if is_groups(value):
+                fixed[key] = [learned(group, f"{prefix}{key}.") for group in value]
+    return fixed
