@@ -1,6 +1,8 @@
 """Stages and scans in a Trainer of Lightning, as docs/lightning.md shows them."""
 
 import copy
+import json
+import os
 import re
 import subprocess
 import sys
@@ -344,3 +346,75 @@ def test_a_flow_of_any_module_is_straightened_and_distilled(tmp_path: Path):
     student = Distill(backbone=OwnNetwork(), parent=tmp_path / "2rf.ckpt", steps=1)
     assert student.hparams.parent["stage"] == "reflow"
     assert student.sample(1).shape == (1, 2, 8, 64)
+
+
+def test_a_training_loader_is_whole_before_during_and_after_a_fit(tmp_path: Path):
+    data = scans(validation={"share": 0.3})  # 8 are left
+    data.setup("fit")
+
+    def numbers() -> list[int]:
+        return [k for batch in data.train_dataloader() for k in batch["k"].tolist()]
+
+    assert numbers() == list(range(8))
+    module = flow()
+    for epochs in (1, 2):
+        quiet_trainer(tmp_path, max_epochs=epochs).fit(module, data)
+        assert numbers() == list(range(8))
+        quiet_trainer(tmp_path).validate(module, data, verbose=False)
+        assert numbers() == list(range(8))
+    trainer = quiet_trainer(tmp_path, max_steps=3)
+    trainer.fit(module, data)  # within the second epoch
+    assert numbers() == list(range(8))
+
+
+PROCESSES = """
+import json, sys
+import lightning as L
+from r2flow import Rectify, ScanDataModule
+
+class Numbers(L.Callback):
+    def on_predict_batch_end(self, trainer, module, outputs, batch, *_):
+        assert len(outputs) == len(batch["k"])
+        seen.extend(batch["k"].tolist())
+
+seen = []
+devices, scenes, backbone, sensor = json.loads(sys.argv[1])
+data = ScanDataModule(sensor=sensor, scenes=scenes, batch_size=4, validation={"share": 0.25})
+trainer = L.Trainer(
+    accelerator="cpu", devices=devices, strategy="ddp" if devices > 1 else "auto", max_epochs=1,
+    logger=False, enable_checkpointing=False, enable_progress_bar=False, callbacks=[Numbers()],
+)
+flow = Rectify(backbone, sensor)
+trainer.fit(flow, data)
+loss = float(trainer.callback_metrics["val/loss"])
+(figures,) = trainer.test(flow, data, verbose=False)
+trainer.predict(flow, data)
+with open(f"{sys.argv[2]}/{trainer.global_rank}.json", "w") as file:
+    json.dump([loss, figures["test/panel"], seen], file)
+"""
+
+
+@pytest.mark.parametrize(
+    ("devices", "scenes"), [(2, 20), pytest.param(4, 12, marks=pytest.mark.slow)]
+)
+def test_processes_measure_as_one(tmp_path: Path, devices: int, scenes: int):
+    held_out = scenes // 4  # 5 by two, 3 by four
+    (tmp_path / "script.py").write_text(PROCESSES)
+    found = {}
+    for number in (1, devices):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        given = json.dumps([number, scenes, BACKBONE, SENSOR])
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+        subprocess.run(
+            [sys.executable, tmp_path / "script.py", given, folder],
+            check=True, timeout=300, env=environment, capture_output=True,
+        )  # fmt: skip
+        found[number] = [json.loads((folder / f"{n}.json").read_text()) for n in range(number)]
+    ((loss, panel, numbers),) = found[1]
+    assert numbers == list(range(held_out))
+    shared = found[devices]
+    assert sorted(k for one in shared for k in one[2]) == numbers
+    for one in shared:
+        # the weights differ by the order of sums
+        assert one[:2] == [pytest.approx(loss, rel=1e-5), pytest.approx(panel, abs=1e-5)]

@@ -127,6 +127,8 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
                     "data.augment changes scans, and an augmented pair is not a flow's; leave it "
                     "out."
                 )
+        # of fewer scans to predict than devices
+        self.allow_zero_length_dataloader_with_multiple_devices = True
         self.item_format: ItemFormat | None = None
         self.names: list[str] = []
         self.opened: Sequence[Mixture] = ()  # as found, before they are read
@@ -352,8 +354,14 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
         """Rank of this process and number of processes."""
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
 
+    @property
+    def _fitting(self) -> bool:
+        """Whether a fit runs, whose place the training scans go on from."""
+        state = self.trainer and self.trainer.state
+        return bool(state and state.fn == "fit" and state.status == "running")
+
     def train_dataloader(self) -> DataLoader[Item]:
-        """The batches of an epoch from the trainer's step on.
+        """The batches of an epoch: in a fit from the trainer's step on, else of the first one.
 
         Raises:
             InputError: the batch cannot be shared by the devices and accumulated parts.
@@ -362,9 +370,10 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
         images = max(len(source) // self.batch_size, 1) * self.batch_size
         order = self._order(source)
         dataset = self._dataset(source, "training")
-        if self.trainer is None:  # a loader by itself, whatever runs it later
+        if not self._fitting:  # a loader by itself, whatever runs it later
             return self._loader(dataset, RunSampler(order, images), self.batch_size)
         sampler = RunSampler(order, images, *self.ranks, self._place)
+        assert self.trainer is not None
         return self._loader(dataset, sampler, self.share(self.trainer))
 
     def share(self, trainer: L.Trainer) -> int:
@@ -412,28 +421,42 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
         sensors = self.sensors if purpose == "training" or self.plan.held_out is None else []
         return FlowDataset(source, item_format, self.seed, purpose, augment, sensors)
 
+    def val_dataloader(self) -> DataLoader[Item] | list[Any]:
+        """The held-out scans, each once over all devices."""
+        return self._held_out()
+
     def test_dataloader(self) -> DataLoader[Item] | list[Any]:
-        """The held-out scans, to compare generated scans with."""
-        return self.val_dataloader(whole=True)
+        """The held-out scans, each once over all devices, to compare generated scans with."""
+        return self._held_out(whole=True)
 
-    predict_dataloader = test_dataloader
+    def predict_dataloader(self) -> DataLoader[Item] | list[Any]:
+        """The held-out scans, each once over all devices, some of which may have none."""
+        return self._held_out(whole=True, idle=True)
 
-    def val_dataloader(self, whole: bool = False) -> DataLoader[Item] | list[Any]:
-        """The held-out scans, each once, without those that are left when the devices share them
-        equally; `whole`: without the stage's further entries.
+    @property
+    def shares_held_out(self) -> bool:
+        """Whether devices share the held-out scans; of fewer scans than devices each takes all."""
+        _, source = self._ready()
+        return len(source) >= self.ranks[1]
+
+    def _held_out(self, whole: bool = False, idle: bool = False) -> DataLoader[Item] | list[Any]:
+        """Batches of the held-out scans; `whole`: without the stage's further entries; `idle`:
+        devices may have none.
         """
         _, source = self._ready()
         if len(source) == 0:
             return []
         rank, ranks = self.ranks
-        batch_size = max(self.batch_size // ranks, 1)
-        # All ranks need the same number of batches, or they would wait for each other: with fewer
-        # scans than ranks, every rank takes all scans; otherwise the remainder is left out.
-        if len(source) < ranks:
+        if not (self.shares_held_out or idle):
             rank = 0
             ranks = 1
-        count = len(source) - len(source) % ranks
-        sampler = RunSampler(range(len(source)), count, rank, ranks, lambda: (0, 0))
+        batch_size = max(self.batch_size // ranks, 1)
+        least, more = divmod(len(source), ranks)
+        if least and more and least % batch_size == 0:
+            # Devices with a scan more would have a batch more, and wait for the others.
+            sizes = [size for size in range(2, least + 2) if least % size]
+            batch_size = min(sizes, key=lambda size: abs(size - batch_size))
+        sampler = RunSampler(range(len(source)), len(source), rank, ranks, lambda: (0, 0))
         return self._loader(self._dataset(source, "validation", whole), sampler, batch_size)
 
     def _loader(

@@ -146,8 +146,8 @@ class RunSampler(DistributedSampler[Key]):
         return (self.rank, self.ranks) if self.ranks else rank_and_world_size()
 
     def __len__(self) -> int:
-        _, ranks = self._share()
-        return self.images // ranks
+        rank, ranks = self._share()
+        return len(range(rank, self.images, ranks))
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         first, done = self.place() if self.place else (self.epoch * self.images, 0)

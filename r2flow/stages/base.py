@@ -322,8 +322,18 @@ class Stage(L.LightningModule, NamedArguments):
         numbers = self.whole_batch(batch)["k"].tolist()
         return draw(self.generator, numbers, self.hparams["seed"]).images
 
+    def log_mean(self, name: str, value: Tensor, batch: Batch, **options: Any) -> None:
+        """Log a mean over the scans of a batch, whose mean over all devices has equal weights."""
+        devices = self._trainer.world_size if self._trainer else 1
+        # Lightning's mean of the devices' counts is cut to a whole number: 2 of 3 and 2.
+        self.log(name, value, batch_size=devices * len(batch["x_1"]), sync_dist=True, **options)
+
     def on_test_start(self) -> None:
-        self.panel = METRICS["panel"](sensor=self.sensor)
+        data = getattr(self.trainer, "datamodule", None)
+        alone = isinstance(data, ScanDataModule) and not data.shares_held_out
+        self.panel = METRICS["panel"](sensor=self.sensor, sync_on_compute=not alone)
+        if self.trainer.world_size > 1:  # a group of GPUs exchanges no tensors of the CPU
+            self.panel.to(self.device)
 
     def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
         batch = self.whole_batch(batch)
@@ -448,7 +458,7 @@ class SingleLoss(Stage):
         # few scans.
         batch = self.whole_batch(batch)
         loss = self.regression_loss(batch, golden_sequence(batch["k"]))
-        self.log("val/loss", loss, prog_bar=True, batch_size=len(batch["x_1"]), sync_dist=True)
+        self.log_mean("val/loss", loss, batch, prog_bar=True)
 
 
 def learning_rate_factor(step: int, warmup: int, total: float) -> float:

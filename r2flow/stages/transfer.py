@@ -217,5 +217,5 @@ class Transfer(SingleLoss):
         )  # fmt: skip
         split = "train" if self.training else "val"
         for name, value in parts.items():
-            self.log(f"{split}/{name}", value, batch_size=len(x_1), sync_dist=True)
+            self.log_mean(f"{split}/{name}", value, batch)
         return torch.stack([WEIGHTS[name] * value for name, value in parts.items()]).sum()

@@ -230,10 +230,32 @@ def test_validation_is_never_augmented_nor_drawn_anew_and_ranks_share_it(numbere
     assert augmented["drawn"].tolist() == [
         noise.generator(0, "condition", k).integers(2**40) for k in range(6)
     ]
-    # two are left over
-    for ranks, seen in ((1, [0, 1, 2, 3, 4, 5]), (4, [1]), (6, [1]), (7, [0, 1, 2, 3, 4, 5])):
-        data.trainer = SimpleNamespace(global_rank=1 % ranks, world_size=ranks)
-        assert [k for batch in data.val_dataloader() for k in batch["k"].tolist()] == seen
+
+
+@pytest.mark.parametrize("batch_size", [1, 2, 4, 8])
+@pytest.mark.parametrize("ranks", [1, 2, 3, 4, 5, 6, 7])
+def test_devices_share_the_held_out_scans_each_once(numbered: Path, ranks: int, batch_size: int):
+    data = module(
+        name="folder", root=str(numbered), validation={"share": 0.5}, batch_size=batch_size
+    )
+
+    def seen(loader: str) -> list[list[list[int]]]:
+        found = []
+        for rank in range(ranks):
+            data.trainer = SimpleNamespace(global_rank=rank, world_size=ranks)
+            found.append([batch["k"].tolist() for batch in getattr(data, loader)()])
+        return found
+
+    for loader in ("val_dataloader", "test_dataloader"):
+        batches = seen(loader)
+        assert len(set(map(len, batches))) == 1  # or devices would wait for each other
+        numbers = [[k for batch in one for k in batch] for one in batches]
+        if ranks <= 6:
+            assert sorted(k for one in numbers for k in one) == list(range(6))
+        else:  # fewer than devices: all on each
+            assert numbers == ranks * [list(range(6))]
+    predicted = [k for one in seen("predict_dataloader") for batch in one for k in batch]
+    assert sorted(predicted) == list(range(6))
 
 
 def learns_reflectance(wanted: bool | str, **options) -> bool:

@@ -208,7 +208,7 @@ class LearnAutoencoder(Stage):
         x = batch["x_1"]
         made, _ = self.autoencoder(x)
         loss = _reconstruction_loss(x, made, self._mask_of(x), self.mask_factor)
-        self.log("val/loss", loss, prog_bar=True, batch_size=len(x), sync_dist=True)
+        self.log_mean("val/loss", loss, batch, prog_bar=True)
 
 
 class LearnLatentDiffusion(SingleLoss):
