@@ -22,7 +22,8 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.utilities.model_helpers import is_overridden
 
 from r2flow.base.config import as_override
-from r2flow.base.errors import InputError, check_folder, one_line
+from r2flow.base.errors import InputError, one_line
+from r2flow.base.files import check_folder
 from r2flow.base.signals import LATER, STOPPING, Stopped, handling_signals
 from r2flow.callbacks.loggers import log_config
 from r2flow.callbacks.stopping import Stopping
