@@ -73,6 +73,15 @@ ColumnsOption = Annotated[
 ]
 
 
+LabelIdsOption = Annotated[
+    str | None,
+    Option(
+        help="List of the ids of .label files: semantic_kitti (default), semantic_kitti_learning, "
+        "nuscenes_lidarseg, semantic_poss, rellis_3d, pandaset, or a YAML file of lines `1: car`."
+    ),
+]
+
+
 ModelArgument = Annotated[Path, Argument(help="A model, a run folder or a checkpoint file.")]
 SeedOption = Annotated[
     int, Option(min=0, max=2**64 - 1, help="Scan i depends only on the seed and i.")
@@ -152,6 +161,7 @@ class ReadingOptions:
     ] = None
     reflectance_scale: ScaleChoice = None
     columns: ColumnsOption = None
+    label_ids: LabelIdsOption = None
 
     def reading(
         self,
