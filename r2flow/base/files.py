@@ -1,7 +1,6 @@
 """Atomic writing of files, and safe reading of JSON."""
 
 import errno
-import fcntl
 import json
 import os
 import secrets
@@ -11,9 +10,8 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-import yaml
 
-from r2flow.base.errors import InputError, check, naming
+from r2flow.base.errors import InputError, naming
 
 
 @contextmanager
@@ -21,8 +19,7 @@ def atomic_write(path: str | Path) -> Iterator[IO[bytes]]:
     """Open a temporary file that replaces `path` when the block ends without an error.
 
     It is flushed to the disk before the rename and the folder after it: a reader, or a power cut,
-    finds the old file or the whole new one. A link stays, and its target is written. The temporary
-    file is locked while it is written: `clear_leftovers` removes those of killed processes.
+    finds the old file or the whole new one. A link stays, and its target is written.
     """
     path = Path(path)
     if path.exists() and not path.is_file():  # the rename would replace a device or a pipe
@@ -33,11 +30,10 @@ def atomic_write(path: str | Path) -> Iterator[IO[bytes]]:
     temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.part"
     try:
         with open(temporary, "xb") as file:
-            locked(file.fileno(), fcntl.LOCK_SH)
             yield file
             file.flush()
             os.fsync(file.fileno())
-            os.replace(temporary, target)
+        os.replace(temporary, target)
         folder = os.open(target.parent, os.O_RDONLY)
         try:
             os.fsync(folder)
@@ -54,39 +50,6 @@ def atomic_write(path: str | Path) -> Iterator[IO[bytes]]:
     finally:
         with suppress(OSError):
             temporary.unlink()
-
-
-def locked(descriptor: int, kind: int) -> bool:
-    """Whether a lock of an open file or folder (`fcntl.flock`) was taken; it ends with its process.
-    Where the file system has no locks, it was.
-    """
-    try:
-        fcntl.flock(descriptor, kind)
-    except BlockingIOError:
-        return False
-    except OSError:  # no locks, as on some network disks
-        return True
-    return True
-
-
-def clear_leftovers(folder: Path) -> None:
-    """Remove temporary files and locks of killed processes from a folder."""
-    for leftover in (*folder.glob(".*.part"), *folder.glob(".*.lock")):
-        with suppress(OSError), open(leftover, "rb") as file:
-            if locked(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB):
-                leftover.unlink()
-
-
-def check_folder(folder: Path) -> None:
-    """Refuse a folder that cannot be written to or created, before any work; with a manifest it may
-    be complete. Clears what killed commands left in it.
-    """
-    there = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
-    usable = there.is_dir() and (
-        (folder / "manifest.json").is_file() or os.access(there, os.W_OK | os.X_OK)
-    )
-    check(usable, f"{there} is not a folder that can be written to; give another one.")
-    clear_leftovers(folder)
 
 
 def write_file(path: str | Path, content: str | bytes) -> None:
@@ -109,13 +72,6 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
-
-
-def parse_yaml(text: str) -> Any:
-    """Plain values of a YAML document; InputError: it has aliases, which can stand for any size."""
-    aliases = any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text))
-    check(not aliases, "it has aliases (*NAME), which can stand for any size: write them out.")
-    return yaml.safe_load(text)
 
 
 @contextmanager
@@ -158,6 +114,10 @@ def reading_errors(path: Path) -> Iterator[None]:
         # pyarrow's messages have several lines.
         reason = " ".join(str(error.strerror or error).split())
         raise InputError(f"{path} cannot be read: {reason}.") from None
+    except MemoryError:
+        raise InputError(f"{path} cannot be read: it needs more memory than is free.") from None
+    except ImportError as error:
+        raise InputError(f"{path} cannot be read: a package is broken ({error}).") from error
     # NumPy, laspy, pyarrow and their decoders raise many kinds on damaged files
     except BaseException as error:
         # Rust decoders

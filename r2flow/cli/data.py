@@ -1,10 +1,8 @@
 """`r2flow simulate`, `prepare`, `sensor` and `unpack`: sources of scans."""
 
-import logging
 import re
-from collections import Counter
+import sys
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -21,13 +19,12 @@ from r2flow.cli.options import (
     SensorOption,
     SizeOption,
     SplitOption,
+    TopicOption,
     WorkersOption,
     cores,
     grouped,
     several,
 )
-
-_log = logging.getLogger(__name__)
 
 
 @app.command(
@@ -136,15 +133,11 @@ def sensor(
     Pass the file to other verbs (--sensor mine.yaml), or place it in conf/sensor/ for train.py
     (sensor=mine).
     """
-    import numpy as np
-
-    from r2flow.base.errors import warn_odd
     from r2flow.base.progress import track
-    from r2flow.data.reading import DARK, is_dark
     from r2flow.data.sources import warn_of_frame
-    from r2flow.lidar.estimation import estimate_sensor, hangs, nearest_sensor
+    from r2flow.lidar.estimation import estimate_sensor, nearest_sensor
     from r2flow.lidar.scan_files import points_beside, read_points
-    from r2flow.lidar.sensors import ENDINGS, SENSORS, sensor_yaml, write_sensor
+    from r2flow.lidar.sensors import ENDINGS, SENSORS, write_sensor
     from r2flow.reports.tables import print_table
     from r2flow.reports.view.panels import list_scans
 
@@ -152,6 +145,8 @@ def sensor(
     if out is not None:
         if out.suffix.lower() not in ENDINGS:
             raise InputError(f"--out must be a .yaml file, as for --sensor; found {out}.")
+        if out.exists():
+            raise InputError(f"{out} exists; give another --out.")
         name = re.sub(r"\W", "_", out.stem, flags=re.ASCII)
         if name in SENSORS or not name[0].isalpha():
             name = f"my_{name}"
@@ -165,10 +160,7 @@ def sensor(
     reflectance = "none: encoding.reflectance=false"
     if scale:
         stored = [one.reflectance for one in points if one.reflectance is not None]
-        values = np.concatenate(stored)
-        beyond = (values > 1.001 * scale).sum()
-        if is_dark(values[values > 0], scale):
-            warn_odd(paths[0], DARK)
+        beyond = sum((values > 1.001 * scale).sum() for values in stored)
         reflectance = f"reflectance_scale={scale:g}; {beyond:,} points beyond are clipped"
     rows = {
         "beams": f"{len(degrees)}: {beams.order}",
@@ -178,17 +170,12 @@ def sensor(
         "resolution": f"{steps:,.0f} steps a turn; images of {mine.columns} columns",
         "range seen": f"{mine.min_range:g} to {mine.max_range:g} m; "
         "raise min_range if the vehicle is visible",
-        "height": "not known: the ground lies above the sensor"
-        if hangs(points)
-        else f"{mine.height:.2f} m above the ground{'' if ground else ', assumed'}",
+        "height": f"{mine.height:.2f} m above the ground{'' if ground else ', assumed'}",
         "reflectance": reflectance,
     }
     print_table(list(rows.items()), ("", ""))
     if out is not None:
-        comment = f"Estimated from {len(points)} scan(s), stored {beams.order}."
-        if out.exists() and out.read_bytes() != sensor_yaml(mine, comment).encode():
-            raise InputError(f"{out} exists, with other content; give another --out.")
-        write_sensor(mine, out, comment)
+        write_sensor(mine, out, f"Estimated from {len(points)} scan(s), stored {beams.order}.")
         print(out)
 
 
@@ -201,41 +188,48 @@ def unpack(
         Path, Argument(help="A .mcap, .db3 or .bag file, or the folder of a ROS 2 bag.")
     ],
     out: OutOption,
-    topic: Annotated[
-        str | None, Option(help="Topic of the point clouds, required if several.")
-    ] = None,
+    topic: TopicOption = None,
     every: Annotated[int, Option(min=1, help="Take every Nth message.")] = 1,
     most: Annotated[
         int | None, Option("--num", min=1, help="Maximum number of scans to write.")
     ] = None,
+) -> None:
+    """Write the PointCloud2 messages of a recording as .ply files with all their fields, named by
+    time in ns.
+
+    The time is header.stamp, if 0 that of recording. r2flow pack makes a recording of the files.
+    """
+    from r2flow.lidar.packing import unpack as write
+
+    print(f"{several(write(recording, out, topic, every, most))} in {out}")
+
+
+@app.command(
+    rich_help_panel="Data",
+    epilog="Example: r2flow pack dense --topic /points --out dense.mcap",
+)
+def pack(
+    scans: Annotated[
+        list[Path], Argument(help="Scan files, folders or NAME:FOLDER, in the order of time.")
+    ],
+    out: Annotated[
+        Path, Option("--out", "-o", help="A .mcap or .db3 of ROS 2, or a .bag of ROS 1.")
+    ],
+    topic: Annotated[str, Option(help="Topic of the messages.")] = "/points",
+    frame: Annotated[
+        str | None,
+        Option(help="frame_id of the messages. Default: as unpacked, else lidar."),
+    ] = None,
+    rate: Annotated[
+        float | None,
+        Option(min=0.001, help="Scans a second. Default: times are names, as of r2flow unpack."),
+    ] = None,
     columns: ColumnsOption = None,
 ) -> None:
-    """Write the PointCloud2 messages of a recording as scan files, named by time in ns.
+    """Write scan files as the PointCloud2 messages of a recording, with all their fields."""
+    from r2flow.lidar.packing import pack as write
+    from r2flow.reports.view.panels import list_scans
 
-    The time is header.stamp, if 0 that of recording. The files contain x, y, z and, if present,
-    intensity and ring.
-    """
-    from r2flow.base.progress import track
-    from r2flow.lidar.bags import read_bag
-    from r2flow.lidar.scan_files import read_points, write_points
-
-    stamps = Counter[int]()
-    messages = track(read_bag(recording, topic, columns), "unpacking", "scans", most or 0)
-    for stamp, points in islice(messages, 0, None, every):
-        if isinstance(points, InputError):
-            _log.warning("left out: %s", points)
-            continue
-        stamps[stamp] += 1
-        name = f"{stamp:019d}"
-        if stamps[stamp] > 1:  # distinct names for clouds of the same time
-            name += f"-{stamps[stamp]}"
-        points = points.with_lost_rays()
-        file = out / f"{name}.ply"
-        if file.exists() and read_points(file).xyz.tobytes() != points.xyz.tobytes():
-            raise InputError(f"{file} holds other points: give another folder by --out.")
-        write_points(file, points.xyz, points.reflectance, points.ring)
-        if stamps.total() == most:
-            break
-    if not stamps:
-        raise InputError(f"{recording} contains no usable scan.")
-    print(f"{several(stamps.total())} in {out}")
+    paths = [path for one in scans for path in list_scans(one, sys.maxsize)[0]]
+    write(paths, out, topic, frame, rate, columns)
+    print(f"{several(len(paths))} in {out}")

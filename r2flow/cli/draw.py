@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from typer import Argument, Option
 
 from r2flow.base.devices import choose_device
-from r2flow.base.errors import InputError, check
-from r2flow.base.files import check_folder
+from r2flow.base.errors import InputError, check, check_folder
 from r2flow.cli.app import app
 from r2flow.cli.options import (
     SETS,
@@ -16,19 +16,20 @@ from r2flow.cli.options import (
     ColumnsOption,
     DeviceOption,
     DrawOptions,
-    LabelIdsOption,
     ModelArgument,
     OutOption,
     SamplerOptions,
     ScaleChoice,
     SeedOption,
     SizeOption,
+    TopicOption,
     grouped,
     several,
 )
 
 if TYPE_CHECKING:
     from r2flow.data.partial import PartialScan
+    from r2flow.generators.base import Precision
     from r2flow.lidar.region import Region
     from r2flow.model.checkpoint import Checkpoint
 
@@ -87,7 +88,6 @@ def sample(
     labels: Annotated[
         str | None, Option(help="A labelled model that labels the points: NAME.label.")
     ] = None,
-    label_ids: LabelIdsOption = None,
 ) -> None:
     """Sample scans from a trained model (default: `street`): point clouds, range images and
     pictures.
@@ -122,7 +122,6 @@ def sample(
         region,
         precision=precision or usual_precision(loaded.generator, model in (None, DEFAULT)),
         labels=_labelling(labels, loaded) if labels else None,
-        label_ids=label_ids,
     )
     there = len(list(out.glob(f"[0-9]*.{formats[0]}")))
     more = f", next to {there - draw.num} of an earlier command" if there > draw.num else ""
@@ -243,11 +242,25 @@ class PartialOptions:
     ] = None
     reflectance_scale: ScaleChoice = None
     columns: ColumnsOption = None
-    label_ids: LabelIdsOption = None
     scans: Annotated[
         int | None,
         Option(min=1, help="Maximum number of scans per folder, evenly spread. Default: all."),
     ] = None
+
+    topic: TopicOption = None
+    other_topics: Annotated[
+        bool, Option("--other-topics", help="Of a recording: keep its other topics, unchanged.")
+    ] = False
+
+    def model(self, name: str, device: str) -> "Checkpoint":
+        """The model, for another sensor if given."""
+        from r2flow.lidar.sensors import named_sensor
+        from r2flow.model.checkpoint import load_checkpoint
+
+        loaded = load_checkpoint(name, choose_device(device))
+        if self.to or self.size:
+            loaded = loaded.through(named_sensor(self.to or loaded.sensor, self.size))
+        return loaded
 
     def open(
         self, model: str, device: str, what: Sequence[str]
@@ -255,12 +268,7 @@ class PartialOptions:
         """The model, for another sensor if given, the scans as it takes them, and remarks on their
         sensor.
         """
-        from r2flow.lidar.sensors import named_sensor
-        from r2flow.model.checkpoint import load_checkpoint
-
-        loaded = load_checkpoint(model, choose_device(device))
-        if self.to or self.size:
-            loaded = loaded.through(named_sensor(self.to or loaded.sensor, self.size))
+        loaded = self.model(model, device)
         return loaded.open_partial(
             what,
             self.source,
@@ -268,7 +276,6 @@ class PartialOptions:
             scale=self.reflectance_scale,
             most=self.scans,
             columns=self.columns,
-            label_ids=self.label_ids,
         )
 
 
@@ -280,7 +287,10 @@ class PartialOptions:
 def complete(
     what: Annotated[
         list[str],
-        Argument(metavar="SCANS", help=f"Scan files, range images (.npy), or {SETS}."),
+        Argument(
+            metavar="SCANS",
+            help=f"Scan files, range images (.npy), or {SETS}; or a recording (.mcap, .db3, .bag).",
+        ),
     ],
     out: OutOption,
     given: PartialOptions,
@@ -312,20 +322,26 @@ def complete(
     """Complete scans: more beams, filled gaps, hidden parts.
 
     Files have the format of the input, or .ply if it cannot be written. The same command resumes an
-    interrupted run.
+    interrupted run. A recording becomes another, as --out dense.mcap.
     """
+    from r2flow.lidar.bags import is_recording
     from r2flow.lidar.known import mask_identity, parse_mask
-    from r2flow.lidar.labels import SEMANTIC_KITTI, label_list
     from r2flow.model.completion import completing, usual_precision
     from r2flow.model.shipped import DEFAULT, DENSIFY
     from r2flow.reports.answer_rays import Job, lack_sectors
     from r2flow.reports.answers import write_completed
 
+    if any(map(is_recording, what)):
+        only = len(what) == 1 and num == 1 and not (given.mask or given.hide or given.scans)
+        check(only, "a recording is completed alone, without --num, --mask, --hide and --scans.")
+        _complete_recording(
+            Path(what[0]), out, given, how, checkpoint or DENSIFY, precision, seed, device
+        )
+        return
     check_folder(out)
     mask = parse_mask(given.mask) if given.mask else None
     hidden = frozenset(given.hide or ())
-    ids = label_list(given.label_ids or SEMANTIC_KITTI)
-    job = Job(num, seed, mask, given.fill_gaps, hidden, batch_size, pictures, label_ids=ids)
+    job = Job(num, seed, mask, given.fill_gaps, hidden, batch_size, pictures)
     jumps = how.given.get("name", "jump") in ("jump", "transport")
     name = checkpoint or (DENSIFY if jumps else DEFAULT)
     loaded, scans, remarks = given.open(name, device, what)
@@ -353,3 +369,48 @@ def complete(
         "columns": given.columns,
     }
     write_completed(loaded, scans, out, job, sampler, about)
+
+
+def _complete_recording(
+    path: Path,
+    out: Path,
+    given: PartialOptions,
+    how: SamplerOptions,
+    name: str,
+    precision: "Precision | None",
+    seed: int,
+    device: str,
+) -> None:
+    from r2flow.model.completion import completing, usual_precision
+    from r2flow.reports.outputs import recipe_of
+    from r2flow.reports.recordings import complete_recording
+
+    check_folder(out.parent)
+    model = given.model(name, device)
+    sampler = completing(model.generator, **how.given)
+    precision = precision or usual_precision(model.generator)
+    completer = model.completer(
+        given.source,
+        reflectance_scale=given.reflectance_scale,
+        columns=given.columns,
+        fill_gaps=given.fill_gaps,
+        sampler=sampler,
+        precision=precision,
+    )
+    settings = {
+        "from": given.source,
+        "reflectance_scale": given.reflectance_scale,
+        "columns": given.columns,
+        "fill_gaps": given.fill_gaps,
+        "precision": precision,
+    }
+    recipe = recipe_of(model, seed, sampler, completion=settings)
+    _print_model(name)
+    complete_recording(
+        path,
+        out,
+        given.topic,
+        given.other_topics,
+        lambda cloud, number: completer(cloud, number, seed),
+        recipe,
+    )

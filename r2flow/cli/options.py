@@ -71,16 +71,9 @@ ColumnsOption = Annotated[
         "names those to rename, such as intensities=reflectance. Default: the format's.",
     ),
 ]
-
-
-LabelIdsOption = Annotated[
-    str | None,
-    Option(
-        help="List of the ids of .label files: semantic_kitti (default), semantic_kitti_learning, "
-        "nuscenes_lidarseg, semantic_poss, rellis_3d, pandaset, or a YAML file of lines `1: car`."
-    ),
+TopicOption = Annotated[
+    str | None, Option(help="Topic of the point clouds of a recording, required if several.")
 ]
-
 
 ModelArgument = Annotated[Path, Argument(help="A model, a run folder or a checkpoint file.")]
 SeedOption = Annotated[
@@ -161,7 +154,6 @@ class ReadingOptions:
     ] = None
     reflectance_scale: ScaleChoice = None
     columns: ColumnsOption = None
-    label_ids: LabelIdsOption = None
 
     def reading(
         self,

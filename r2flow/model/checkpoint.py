@@ -154,7 +154,6 @@ class Checkpoint:
         sensor: Sensor | str | None = None,
         columns: Sequence[str] | None = None,
         keep_beams: bool = False,
-        label_ids: str | None = None,
         **how: Any,
     ) -> "tuple[Checkpoint, list[PartialScan], list[str]]":
         """This model for the sensor of scans to complete, the scans, and remarks; see
@@ -164,16 +163,12 @@ class Checkpoint:
         that sees past its own.
         """
         named = None if sensor is None else named_sensor(sensor)
-        reading = reading_for(
-            [], self, columns=columns, labels=self.encoding.labels, label_ids=label_ids
-        )
+        reading = reading_for([], self, columns=columns, labels=self.encoding.labels)
         scans, remarks = open_partial(specs, reading, named, **how)
         transfers = isinstance(self.generator, TransferFlow)
         views = {scan.whole for scan in scans}
         if keep_beams and transfers and len(views) == 1 and (view := views.pop()):
-            model, scans, remarks = self.through(view).open_partial(
-                specs, sensor, columns, label_ids=label_ids, **how
-            )
+            model, scans, remarks = self.through(view).open_partial(specs, sensor, columns, **how)
             size = "x".join(map(str, view.shape))
             remarks.append(f"completed in their own view, as {size}, which keeps all their beams")
             return model, scans, remarks

@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from r2flow.base.errors import InputError
-from r2flow.lidar.bags import cloud_points, read_bag
+from r2flow.lidar.bags import read_bag
+from r2flow.lidar.point_cloud2 import cloud_of
 from r2flow.lidar.scan_files import read_points
 from tests.lidar.conftest import assert_points
 
 pytest.importorskip("rosbags", reason="rosbags is not installed")
 pytest.importorskip("mcap", reason="mcap is not installed")
 
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
@@ -109,8 +111,9 @@ def test_each_cloud_is_read_as_it_was_recorded(tmp_path: Path, storage: str):
     for path in {file, tmp_path / "drive"} if storage != "bag" else {file}:
         found = list(read_bag(path))
         assert [stamp for stamp, _ in found] == [10**9 + 5, 2 * 10**9 + 5, 3 * 10**9]
-        for (_, points), xyz in zip(found, CLOUDS, strict=True):
-            assert_points(points, xyz, *fields(len(xyz)))
+        for (_, scan), xyz in zip(found, CLOUDS, strict=True):
+            assert scan.frame == "lidar"
+            assert_points(scan.cloud.points(), xyz, *fields(len(xyz)))
 
 
 def test_unpack_writes_files_that_every_verb_reads(r2flow, tmp_path: Path):
@@ -125,7 +128,7 @@ def test_unpack_writes_files_that_every_verb_reads(r2flow, tmp_path: Path):
     )
     names = [
         f"{10**9 + 5:019d}.ply",
-        f"{10**9 + 5:019d}-2.ply",
+        f"{10**9 + 5:019d}_000002.ply",
         f"{2 * 10**9:019d}.ply",
     ]  # two of one time
     assert {path.name for path in out.iterdir()} == set(names)
@@ -154,7 +157,7 @@ def test_recordings_without_clouds_or_damaged_are_one_line(r2flow, tmp_path: Pat
     (tmp_path / "drive.mcap.zstd").write_bytes(b"\x28\xb5\x2f\xfd")
     for path, words in (
         (whole, "/points (std_msgs/String, encoding cdr)"),
-        (cut, f"mcap recover {cut} -o whole.mcap"),
+        (cut, "cut off, as by a crash, and holds no whole message"),
         (other, "not a readable .bag file"),
         (tmp_path / "missing.mcap", "No such file"),
         (tmp_path / "empty", "metadata file"),
@@ -194,8 +197,8 @@ def write_mcap(
 
 def assert_clouds(path: Path) -> None:
     found = list(read_bag(path))
-    for (_, points), xyz in zip(found, CLOUDS, strict=True):
-        assert_points(points, xyz, *fields(len(xyz)))
+    for (_, scan), xyz in zip(found, CLOUDS, strict=True):
+        assert_points(scan.cloud.points(), xyz, *fields(len(xyz)))
 
 
 @pytest.mark.parametrize(
@@ -238,13 +241,35 @@ def test_other_clouds_are_one_line_with_their_encoding_and_a_tool(tmp_path, opti
     assert "damaged" not in str(caught.value)
 
 
-@pytest.mark.parametrize("share", [0.5, 0.9, 1.0])
-def test_a_recording_that_was_cut_off_names_mcap_recover(tmp_path: Path, share: float):
-    whole = write_mcap(tmp_path / "whole.mcap", chunk_size=1).read_bytes()
+@pytest.mark.parametrize("chunked", [True, False])
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.9, 1.0])
+def test_of_a_recording_that_was_cut_off_the_whole_clouds_are_read(
+    tmp_path, caplog, share, chunked
+):
+    """mcap's reader takes the half of a message at the end for a message."""
+    how = {"chunk_size": 1, "compression": CompressionType.NONE, "use_chunking": chunked}
+    file = write_mcap(tmp_path / "whole.mcap", **how)
+    whole = file.read_bytes()
+    with file.open("rb") as stream:
+        data = [one.data for *_, one in make_reader(stream).iter_messages()]
+    end = int(share * len(whole)) - 1
+    expected = sum(whole.index(one) + len(one) <= end for one in data)
     path = tmp_path / "cut.mcap"
-    path.write_bytes(whole[: int(share * len(whole)) - 1])
-    with pytest.raises(InputError, match=f"cut off.*mcap recover {path}"):
-        list(read_bag(path))
+    path.write_bytes(whole[:end])
+    found = list(read_bag(path))
+    assert len(found) == expected > 0
+    for (_, scan), xyz in zip(found, CLOUDS[:expected], strict=True):
+        assert_points(scan.cloud.points(), xyz, *fields(len(xyz)))
+    assert f"cut off, as by a crash: its {expected} whole messages are used" in caplog.text
+
+
+def test_a_damaged_recording_names_mcap_recover(tmp_path: Path):
+    file = write_mcap(tmp_path / "whole.mcap", compression=CompressionType.NONE)
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 255
+    file.write_bytes(content)
+    with pytest.raises(InputError, match=f"damaged.*mcap recover {file}"):
+        list(read_bag(file))
 
 
 @pytest.mark.parametrize("storage", ["MCAP", "SQLITE3"])
@@ -272,27 +297,22 @@ def test_a_cloud_without_padding_needs_no_row_step(row_step: int):
     cloud = message(get_typestore(Stores.ROS2_HUMBLE), CLOUDS[0])
     assert (cloud.width, cloud.row_step) == (20, 20 * 24)
     cloud.row_step = row_step
-    assert_points(cloud_points(Path("a.db3"), cloud), CLOUDS[0], *fields(40))
+    assert_points(cloud_of(Path("a.db3"), cloud).points(), CLOUDS[0], *fields(40))
 
 
 def test_rows_that_overlap_are_refused():
     cloud = message(get_typestore(Stores.ROS2_HUMBLE), CLOUDS[0], extra=8)
     cloud.row_step = 20
     with pytest.raises(InputError, match="row_step 20 is below width x point_step, 480"):
-        cloud_points(Path("a.db3"), cloud)
+        cloud_of(Path("a.db3"), cloud)
 
 
-def test_fields_of_a_recording_are_renamed(r2flow, tmp_path: Path, monkeypatch):
-    """Autoware's channel is the ring; an unknown field of reflectance is named."""
+def test_other_names_of_fields_are_known():
+    """Autoware's channel is the ring; a field of another name is renamed by the user."""
     names = {"intensity": "signal", "ring": "channel"}
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    cloud = message(store, CLOUDS[0])
-    for field in cloud.fields:
+    message_ = message(get_typestore(Stores.ROS2_HUMBLE), CLOUDS[0])
+    for field in message_.fields:
         field.name = names.get(field.name, field.name)
-    assert_points(cloud_points(tmp_path, cloud), CLOUDS[0], None, fields(40)[1])
-    assert_points(cloud_points(tmp_path, cloud, ["signal=reflectance"]), CLOUDS[0], *fields(40))
-    file = record(tmp_path / "drive", "MCAP")
-    out = tmp_path / "scans"
-    assert r2flow("unpack", file, "--columns", "ring=reflectance", "--out", out)[0] == 0
-    first = read_points(sorted(out.iterdir())[0])
-    assert_points(first, CLOUDS[0], fields(40)[1])
+    cloud = cloud_of(Path("a.db3"), message_)
+    assert_points(cloud.points(), CLOUDS[0], None, fields(40)[1])
+    assert_points(cloud.renamed(["signal=reflectance"]).points(), CLOUDS[0], *fields(40))

@@ -39,7 +39,10 @@ _READERS = (
 # Endings of formats that are not read, with advice on conversion.
 ELSEWHERE = {
     TABLE_ENDINGS: "is read if it is PandaSet's: data=pandaset, in a verb pandaset:FOLDER",
-    (".mcap", ".db3", ".bag"): ("holds many scans: r2flow unpack {path} --out FOLDER writes them"),
+    (".mcap", ".db3", ".bag"): (
+        "holds many scans: r2flow unpack {path} --out FOLDER writes them, and r2flow complete "
+        "takes it by itself"
+    ),
     (".pcap", ".pcapng", ".osf"): (
         "holds packets, which the maker's tool turns into scans (Ouster: ouster-cli source {path} "
         "save scan.csv, a file a scan; Velodyne: VeloView, Save As CSV; Hesai, RoboSense: their "

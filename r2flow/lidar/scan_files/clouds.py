@@ -119,7 +119,13 @@ def read_ply(path: Path) -> Cloud:
     if name != "vertex":
         raise InputError("its first element is not 'vertex', the points.")
     names = tuple(name.strip() for _, name in properties)
-    return Cloud(names, tuple(_columns(body, row, int(count), encoding, last=not others)))
+    columns = tuple(_columns(body, row, int(count), encoding, last=not others))
+    # Stanford's way of an organised cloud.
+    sides = re.findall(r"^obj_info num_(?:rows|cols) (\d+)$", head, re.MULTILINE)
+    height, width = map(int, sides) if len(sides) == 2 else (0, 0)
+    grid = (height, width) if height * width == int(count) and height > 1 else None
+    comments = tuple(re.findall(r"^comment (.*\S)", text, re.MULTILINE))
+    return Cloud(names, columns, shape=grid, header=comments)
 
 
 def write_ply(file: IO[bytes], cloud: Cloud) -> None:
@@ -130,8 +136,14 @@ def write_ply(file: IO[bytes], cloud: Cloud) -> None:
         held = PLY_TYPES.get(kind.str[1:])
         _check_type(name, kind, "PLY", held, "integers of 1, 2, 4 bytes and floats of 4, 8")
         properties.append(f"property {held} {name}\n")
+    lines = [f"comment {line}\n" for line in cloud.header or ()]
+    if cloud.shape:
+        lines += [
+            f"obj_info num_{side} {n}\n"
+            for side, n in zip(("rows", "cols"), cloud.shape, strict=True)
+        ]
     file.write(
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n"
+        f"ply\nformat binary_little_endian 1.0\n{''.join(lines)}element vertex {len(rows)}\n"
         f"{''.join(properties)}end_header\n".encode()
     )
     file.write(rows.tobytes())
@@ -163,7 +175,7 @@ def _split_header(data: bytes) -> tuple[str, bytes]:
     end = re.search(rb"^(DATA|end_header)\b.*\n", data[: 1 << 16], re.MULTILINE)
     if end is None:
         raise InputError("it has no header of its format. Is it damaged?")
-    return data[: end.end()].decode("ascii", "replace"), data[end.end() :]
+    return data[: end.end()].decode("utf-8", "replace"), data[end.end() :]
 
 
 def _columns(
