@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from typer import Argument, Option
 
@@ -48,39 +48,85 @@ def ablate(
     num: Annotated[int, Option(min=2, help="Held-out scans, and samples of each run.")] = 64,
     evaluations: Annotated[
         Any,
-        Option(parser=parse_counts, metavar="N,N,...", help="Network evaluations of samples."),
-    ] = "1,2,4,16",
+        Option(
+            parser=parse_counts,
+            metavar="N,N,...",
+            help="Network evaluations of samples. Default: 1,2,4,16; of systems, each one's own.",
+        ),
+    ] = None,
+    format: Annotated[
+        Literal["md", "tex"], Option(help="tex: also write the table for LaTeX.")
+    ] = "md",
+    rows: Annotated[
+        Path | None,
+        Option(help="CSV of the finished runs, of any budget. Default: OUT/ablation.csv."),
+    ] = None,
     out: OutOption = Path("runs/ablation"),
     device: DeviceOption = "auto",
 ) -> int:
     """Compare settings at equal training time: train every combination of values with several
     seeds, then measure cost and quality.
 
-    The same command resumes. trainer.max_steps=N compares at equal steps instead.
+    The same command resumes. Runs in the CSV are not trained again, so that another machine goes
+    on with the missing ones. trainer.max_steps=N compares at equal steps instead.
     """
-    from r2flow.base.progress import track
+    from r2flow.base.files import write_file
     from r2flow.base.signals import LATER
     from r2flow.data.opening import open_scans, reading_for
-    from r2flow.model.checkpoint import load_checkpoint
-    from r2flow.reports.ablation import ablation_page, measure_run, print_ablation, write_csv
+    from r2flow.data.sets import ScanSet
+    from r2flow.model.checkpoint import Checkpoint
+    from r2flow.reports.ablation import Judge, measure_run, read_rows, reference_rows, write_rows
+    from r2flow.reports.ablation_page import COLUMNS, ablation_page
     from r2flow.reports.pages import write_page
+    from r2flow.reports.tables import latex, print_markdown
     from r2flow.runs.ablation import Ablation, training_cost
 
     where = choose_device(device)
     check_folder(out)
     ablation = Ablation(keys, seeds, budget, out)
     held_out = real or ablation.simulated()
-    if not ablation.train():
-        return LATER
-    first = next(iter(ablation.runs.values()))[0]
-    scans = open_scans(held_out, reading_for([held_out], load_checkpoint(first)), num=num)
-    figures = {}
-    for run in track([run for runs in ablation.runs.values() for run in runs], "measuring", "runs"):
-        figures[run] = training_cost(run) | measure_run(run, scans, evaluations, where)
-    groups = {name: [figures[run] for run in runs] for name, runs in ablation.runs.items()}
-    count = several(seeds, "seed")
-    about = f"{count}; {len(scans)} held-out scans of {scans.label}, as many samples."
-    page = ablation_page(groups, ablation.swept, about, seeds, where)
-    print_ablation(groups, page)
-    print(*write_page(page, out), write_csv(page, out / "ablation.csv"), sep="\n")
+    if not ablation.of_systems:
+        evaluations = evaluations or [1, 2, 4, 16]
+    ablation.check()
+    path = rows or out / "ablation.csv"
+    settings = f"{ablation.settings}; {num} scans of {held_out}"
+    stored = [row for row in read_rows(path) if row["settings"] == settings]
+    others = [row for row in read_rows(path) if row["settings"] != settings]
+    seconds = ablation.seconds
+    done = {(row["seed"], row["combination"]) for row in stored if row["budget"] == seconds}
+    missing = [run for run in ablation.runs if run not in done]
+    if missing:
+        first = ablation.first()
+        model = Checkpoint(first.stage.generator, first.config.plain())
+        scans = open_scans(held_out, reading_for([held_out], model), num=num)
+        source: Any = first.data.training_source
+        training = ScanSet("training scans", source, scans.sensor)
+        judge = Judge(scans, training, where)
+        if not stored:
+            stored = [{"settings": settings, "budget": 0, **row} for row in reference_rows(judge)]
+    for number, (seed, name) in enumerate(missing, 1):
+        left = (len(missing) - number + 1) * seconds / 60
+        print(
+            f"[{number}/{len(missing)}] {name}, seed {seed}: {left:.0f} min of training left",
+            flush=True,
+        )
+        if not ablation.train(seed, name):
+            return LATER
+        run = {"combination": name, "seed": seed, "budget": seconds, "settings": settings}
+        spent = 0.0
+        for link in ablation.runs[seed, name]:
+            cost = training_cost(link.config.run_dir)
+            spent += cost["seconds of training"]
+            for row in measure_run(link.config.run_dir, judge, evaluations):
+                stored.append({**run, "model": link.name or name, **cost, **row})
+                stored[-1]["seconds of training"] = spent
+        write_rows([*others, *stored], path)
+    about = f"{several(seeds, 'seed')} of {seconds / 60:.3g} minutes each; {settings}."
+    page = ablation_page(stored, list(ablation.variants), seconds, about, where)
+    print_markdown("\n\n".join(page.text))
+    written = [*write_page(page, out), path]
+    if format == "tex":
+        write_file(out / "ablation.tex", latex(page.rows, COLUMNS))
+        written.append(out / "ablation.tex")
+    print(*written, sep="\n")
     return 0

@@ -1,82 +1,154 @@
-"""Ablation: cost and quality of combinations of settings, with their spread over seeds.
-
-Two combinations differ by a figure if their intervals of mean +- 2 standard errors over the seeds
-do not overlap.
-"""
+"""Measurements of an ablation: cost and quality of its runs, as rows of a CSV."""
 
 import csv
+import ctypes
 import io
-import json
 import math
 import sys
+import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean, stdev
+from typing import Any
 
+import numpy as np
 import torch
-from matplotlib.figure import Figure
-from rich.box import SIMPLE
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
-from r2flow.base.files import read_json, write_file
+from r2flow.base.files import write_file
 from r2flow.base.noise import Draws
 from r2flow.data.sets import ScanSet
+from r2flow.data.sources import InMemory
 from r2flow.evaluation.comparing import Comparer
+from r2flow.evaluation.copies import find_nearest
 from r2flow.evaluation.measuring import Work
 from r2flow.evaluation.protocols import PROTOCOLS
-from r2flow.evaluation.sets import sampled_set
+from r2flow.evaluation.sets import baseline_sets, sampled_set
 from r2flow.flow.path import interpolate
 from r2flow.flow.straightness import straightness
-from r2flow.generators import Flow, as_flow
+from r2flow.generators import Flow, Generator, Sampler, as_flow
 from r2flow.metrics import METRICS
-from r2flow.metrics.things import LINES
+from r2flow.metrics.panel import REFLECTANCE, distances, mean_distance, panel
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint
-from r2flow.model.saving import weights_hash
 from r2flow.reports.backbones import cost
-from r2flow.reports.pages import Page, Plot, lines_figure
-from r2flow.reports.tables import Row, shown, table
+from r2flow.reports.tables import Row
 
 TIMES = (0.1, 0.3, 0.5, 0.7, 0.9)  # of the error of x_1
 BATCH = 8
 PATHS = 8  # scans of the bend
-# Kinds of figures in the order of the table; those of `COSTS` are not judged. An untrained flow is
-# straight, too.
-JUDGED = ("distance", *LINES, "error of x_1")
-COSTS = ("bend", "parameters", "GMAC", "ms", "images/s", "seconds")
-RULE = (
-    "Mean ± standard error over the seeds. * the best of its row, = no difference from the best: "
-    "the intervals of mean ± 2 standard errors overlap. "
-    "Lower is better; things are judged by their distance from the real value. "
-    '"in 4": in 4 network evaluations.'
-)
-
-Groups = Mapping[str, Sequence[Row]]  # figures of each seed's run, by combination
+_METRICS = ("things", "jsd", "mmd", "kid_handcrafted_range", "frechet_handcrafted_range")
+_WORK = Work(BATCH)
+_TEXTS = ("combination", "model", "sampler", "settings")  # columns that are no numbers
+# Samplers and numbers of steps by a generator's default sampler; of others it is the only one.
+_SYSTEMS: Mapping[str, Mapping[str, Sequence[int]]] = {
+    "adams3": {"euler": (1, 2, 4, 8, 16), "adams3": (2, 4, 8, 16)},
+    "ddpm": {"ddpm": (8, 32, 256), "ddim": (8, 32)},
+    "latent_ddim": {"latent_ddim": (8, 50)},
+}
 
 
-def measure_run(run: Path, real: ScanSet, evaluations: Sequence[int], device: str) -> Row:
-    """Figures of a run by their titles; they are stored in its folder and read from there.
+@dataclass
+class Judge:
+    """Measures sets of scans against the same held-out ones, and their copies of training scans."""
+
+    real: ScanSet
+    training: ScanSet
+    device: str
+
+    def __post_init__(self) -> None:
+        self.counts = panel(self.real[:].numpy(), self.real.sensor)
+        metrics = {name: METRICS[name]().to(self.device) for name in _METRICS}
+        self.compare = Comparer(metrics, _WORK, PROTOCOLS["r2flow"], None, None, self.device)
+
+    def figures(self, images: Tensor) -> Row:
+        """Figures of a set of images, (N, 2 or 1, H, W). The error of the distance is the
+        jackknife's over the scans.
+        """
+        names = [f"sample {number}" for number in range(len(images))]
+        sampled = ScanSet("samples", InMemory(images.numpy(), names), self.real.sensor)
+        measured = self.compare("judged", "", self.real, sampled).measured
+        rows = np.stack([panel(image[None], self.real.sensor) for image in images.numpy()])
+        total = rows.sum(0)
+        lines = distances(self.counts, total)
+        without = [_of_range(distances(self.counts, total - row)) for row in rows]
+        nearest = find_nearest({"": sampled}, self.training, _WORK, self.device)[""].distances
+        return {
+            "distance": mean_distance(lines),
+            "distance of ranges": _of_range(lines),
+            "error": math.sqrt(len(rows) - 1) * float(np.std(without)),
+            **{key: value for result in measured for key, value in result.figures.items()},
+            "copies": float(np.median(nearest)),
+        }
+
+
+def _of_range(lines: Mapping[str, float]) -> float:
+    """The panel's mean without reflectance, which some systems do not draw."""
+    return mean_distance({line: value for line, value in lines.items() if line != REFLECTANCE})
+
+
+def measure_run(run: str, judge: Judge, evaluations: Sequence[int] | None) -> list[Row]:
+    """Figures of a run by its samplers: its default one in `evaluations`, else those of `_SYSTEMS`.
 
     Every run has the same held-out scans and the same noise.
     """
-    checkpoint = load_checkpoint(run, device)
-    recipe = [weights_hash(checkpoint), real.label, len(real), str(real.identity), *evaluations]
-    path = run / "ablation.json"
-    if path.is_file():
-        stored = read_json(path)
-        if stored["recipe"] == recipe:
-            return stored["figures"]
-    costs = cost(checkpoint.config, 5, device)
+    checkpoint = load_checkpoint(run, judge.device)
+    generator = checkpoint.generator
+    if not generator.unconditional:
+        return []
+    costs = cost(checkpoint.config, 5, judge.device)
     figures: Row = {
         "parameters, millions": costs["parameters"] / 1e6,
         "GMAC": costs["gmac"],
         "ms an evaluation": costs["latency_ms"],
     }
-    figures |= _of_velocity(checkpoint, real, device)
-    figures |= _of_samples(checkpoint, real, evaluations, device)
-    write_file(path, json.dumps({"recipe": recipe, "figures": figures}, indent=1))
-    return figures
+    if isinstance(generator, Flow):
+        figures |= _of_velocity(checkpoint, judge.real, judge.device)
+    rows = []
+    for sampler in _samplers(generator, evaluations):
+        images, drawing = _drawn(checkpoint, len(judge.real), sampler)
+        row = {**figures, "sampler": sampler.name, "evaluations": sampler.evaluations(generator)}
+        rows.append(row | drawing | judge.figures(images))
+    return rows
+
+
+def _samplers(generator: Generator, evaluations: Sequence[int] | None) -> list[Sampler]:
+    default = generator.sampler
+    chosen = {default.name: evaluations} if evaluations else _SYSTEMS.get(default.name, {})
+    if generator.fixed:
+        kept = not evaluations or default.evaluations(generator) in evaluations
+        return [default] if kept else []
+    return [
+        generator.choose(name, steps=steps) for name, counts in chosen.items() for steps in counts
+    ] or [default]
+
+
+def _drawn(checkpoint: Checkpoint, num: int, sampler: Sampler) -> tuple[Tensor, Row]:
+    """Scans, with the processor seconds of one and the memory of a batch of `BATCH`, in MiB."""
+    source = sampled_set(checkpoint, "", num, sampler).source
+    source.batch([0])  # the first call is slower
+    before = _resident(reset=True)
+    begin = time.process_time()
+    batches = [source.batch(range(i, min(i + BATCH, num))) for i in range(0, num, BATCH)]
+    seconds = (time.process_time() - begin) / num
+    return torch.cat(batches), {"seconds a scan": seconds, "MiB": _resident("VmHWM") - before}
+
+
+def _resident(line: str = "VmRSS", reset: bool = False) -> float:
+    """Resident memory, or its peak since the last reset (VmHWM), in MiB; NaN except on Linux."""
+    if not sys.platform.startswith("linux"):
+        return math.nan
+    if reset:
+        ctypes.CDLL(None).malloc_trim(0)  # what was freed before is no part of it
+        Path("/proc/self/clear_refs").write_text("5")
+    status = Path("/proc/self/status").read_text().partition(f"{line}:")[2]
+    return int(status.split()[0]) / 1024
+
+
+def reference_rows(judge: Judge) -> list[Row]:
+    """Figures of as many training scans as held-out ones, and of the baselines."""
+    count = len(judge.real)
+    sets = {"training scans": judge.training.spread(count), **baseline_sets(judge.real, count)}
+    return [{"combination": name, **judge.figures(scans[:])} for name, scans in sets.items()]
 
 
 @torch.no_grad()
@@ -109,166 +181,28 @@ def _squared_errors(flow: Flow, x_0: Tensor, x_1: Tensor) -> Tensor:
     return torch.stack(sums)
 
 
-def _of_samples(
-    checkpoint: Checkpoint, real: ScanSet, evaluations: Sequence[int], device: str
-) -> Row:
-    """Distance and things of as many samples as real scans, by numbers of evaluations."""
-    generator = checkpoint.generator
-    metrics = {name: METRICS[name]().to(device) for name in ("panel", "things")}
-    compare = Comparer(metrics, Work(BATCH), PROTOCOLS["r2flow"], None, None, device)
-    figures: Row = {}
-    for count in evaluations:
-        if generator.fixed and count != generator.sampler.evaluations(generator):
-            continue
-        sampler = generator.sampler if generator.fixed else generator.choose(steps=count)
-        sampled = sampled_set(checkpoint, "", len(real), sampler)
-        measured = {r.metric: r.figures for r in compare("judged", "", real, sampled).measured}
-        figures[f"distance in {count}"] = measured["panel"]["panel"]
-        for line in LINES:
-            figures[f"{line} in {count}"] = measured["things"][line]
-            figures[f"{line}, real"] = measured["things"][f"{line}, real"]
-    return figures
-
-
-def measures(groups: Groups) -> list[str]:
-    """Titles of the figures in the order of the table."""
-    titles = dict.fromkeys(title for rows in groups.values() for row in rows for title in row)
-    kinds = (*JUDGED, *COSTS)
-    return [
-        title
-        for kind in kinds
-        for title in titles
-        if title.startswith(kind) and not title.endswith(", real")
-    ]
-
-
-def kind_of(title: str) -> str:
-    """The kind of a figure: its title without evaluations or time."""
-    return next(kind for kind in (*JUDGED, *COSTS) if title.startswith(kind))
-
-
-def table_rows(groups: Groups) -> list[Row]:
-    """One row per figure: each combination's mean ± standard error, the real value, the verdict."""
-    rows = []
-    for title in measures(groups):
-        level = best(groups, title)
-        measured = [runs for runs in groups.values() if any(title in run for run in runs)]
-        same = len(level) == len(measured) > 1
-        row: Row = {"figure": title}
-        for name, runs in groups.items():
-            mark = ""
-            if name in level and not same:
-                mark = " *" if name == level[0] else " ="
-            row[name] = _cell([run[title] for run in runs if title in run]) + mark
-        row["real"] = next(iter(groups.values()))[0].get(f"{kind_of(title)}, real")
-        row["verdict"] = "no difference" if same else ""
-        rows.append(row)
-    return rows
-
-
-def best(groups: Groups, title: str) -> list[str]:
-    """The best combination by a figure, then those that do not differ from it.
-
-    None without a spread, and for a figure that is not judged.
-    """
-    if kind_of(title) in COSTS:
+def read_rows(path: Path) -> list[Row]:
+    """The rows of finished runs, without their empty cells; none if the file is missing."""
+    if not path.is_file():
         return []
-    intervals = {name: spread(errors(runs, title)) for name, runs in groups.items()}
-    known = {name: one for name, one in intervals.items() if not math.isnan(one[1])}
-    order = sorted(known, key=lambda name: known[name][0])
-    if len(order) < 2:
-        return []
-    top = known[order[0]][0] + 2 * known[order[0]][1]
-    return [name for name in order if known[name][0] - 2 * known[name][1] <= top]
+    with path.open(encoding="utf-8", newline="") as lines:
+        return [
+            {key: _value(key, text) for key, text in row.items() if text}
+            for row in csv.DictReader(lines)
+        ]
 
 
-def spread(values: Sequence[float]) -> tuple[float, float]:
-    """Mean and standard error of the mean; NaN where they are not defined."""
-    if not values:
-        return math.nan, math.nan
-    error = stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.nan
-    return fmean(values), error
+def _value(column: str, text: str) -> Any:
+    return text if column in _TEXTS else float(text)
 
 
-def errors(runs: Sequence[Row], title: str) -> list[float]:
-    """A figure of each run; of things, its distance from the real value."""
-    real = f"{kind_of(title)}, real"
-    return [abs(run[title] - run.get(real, 0.0)) for run in runs if title in run]
-
-
-def _cell(values: Sequence[float]) -> str:
-    mean, error = spread(values)
-    return shown(mean) if not error > 0 else f"{shown(mean)} ± {float(f'{error:.1g}'):g}"
-
-
-def conclusion(groups: Groups, title: str) -> str:
-    """All combinations in the order of a figure, and those that are best, in two sentences."""
-    means = [(spread(errors(runs, title))[0], name) for name, runs in groups.items()]
-    order = sorted(pair for pair in means if not math.isnan(pair[0]))
-    listed = "; ".join(f"{name} {shown(mean)}" for mean, name in order)
-    level = best(groups, title)
-    verdict = "One seed: no verdict"
-    if level:
-        verdict = f"Best: {level[0]}"
-    if len(level) > 1:
-        verdict += f"; no difference: {'; '.join(level[1:])}"
-    return f"{title.capitalize()}: {listed}. {verdict}."
-
-
-def print_ablation(groups: Groups, page: Page) -> None:
-    """Print the table, a part for each kind of figure, and the first sentences of the page."""
-    console = Console(width=None if sys.stdout.isatty() else 160)
-    grid = Table("figure", *groups, "real", "verdict", title=page.title, box=SIMPLE)
-    rows = table_rows(groups)
-    kinds = [kind_of(row["figure"]) for row in rows]
-    for row, kind, after in zip(rows, kinds, [*kinds[1:], ""], strict=True):
-        grid.add_row(*map(shown, row.values()), end_section=kind in JUDGED and kind != after)
-    console.print(grid)
-    print(*page.text[:2], RULE, sep="\n")
-
-
-def figure_of(groups: Groups) -> Figure:
-    """Distance against evaluations and error of x_1 against time, with mean ± 2 standard errors."""
-    plots = []
-    bands = []
-    for start, label in (("distance in ", "network evaluations"), ("error of x_1, t = ", "t")):
-        titles = [title for title in measures(groups) if title.startswith(start)]
-        x = [float(title.removeprefix(start)) for title in titles]
-        spreads = [[spread(errors(runs, title)) for title in titles] for runs in groups.values()]
-        means = [[mean for mean, _ in one] for one in spreads]
-        lines = {name: (x, y) for name, y in zip(groups, means, strict=True)}
-        plots.append(Plot(label, kind_of(start), lines, log_x=label != "t"))
-        bands.append((x, spreads))
-    figure = lines_figure(plots, 2)
-    for axes, (x, spreads) in zip(figure.axes, bands, strict=True):
-        for line, one in zip(axes.lines, spreads, strict=True):
-            low = [mean - 2 * error for mean, error in one]
-            high = [mean + 2 * error for mean, error in one]
-            axes.fill_between(x, low, high, color=line.get_color(), alpha=0.15, lw=0)
-    return figure
-
-
-def ablation_page(groups: Groups, swept: str, about: str, seeds: int, device: str) -> Page:
-    """Build the page of an ablation: conclusion, table, figure; its rows are the runs."""
-    runs = [
-        {"combination": name, "seed": seed, **row}
-        for name, rows in groups.items()
-        for seed, row in enumerate(rows)
-    ]
-    last = [title for title in measures(groups) if title.startswith("distance")][-1:]
-    sentences = [conclusion(groups, title) for title in last]
-    rows = table_rows(groups)
-    text = [*sentences, about, table(rows, {key: key for key in rows[0]}), RULE]
-    figures = {"ablation": figure_of(groups)}
-    return Page("ablation", f"Ablation: {swept}", text, runs, figures, {"runs": seeds}, device)
-
-
-def write_csv(page: Page, path: Path) -> Path:
-    """Write the rows of a page, one per run."""
-    columns = list(dict.fromkeys(key for row in page.rows for key in row))
+def write_rows(rows: Sequence[Row], path: Path) -> Path:
+    """Write the rows of finished runs, one for each sampler, with six digits."""
+    columns = list(dict.fromkeys(key for row in rows for key in row))
     lines = io.StringIO()
     writer = csv.DictWriter(lines, columns, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(page.rows)
+    for row in rows:
+        writer.writerow({k: f"{x:.6g}" if isinstance(x, float) else x for k, x in row.items()})
     write_file(path, lines.getvalue())
     return path

@@ -29,6 +29,18 @@ def table(rows: Rows, columns: Columns) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
+def latex(rows: Rows, columns: Columns) -> str:
+    """Format rows as a LaTeX table of the package booktabs."""
+    lines = [
+        " & ".join(re.sub(r"([&%$#_{}])", r"\\\1", cell) for cell in line).replace("±", r"$\pm$")
+        for line in _as_text(rows, columns)
+    ]
+    head, *body = (rf"{line} \\" for line in lines)
+    kinds = "l" * len(columns)
+    parts = [rf"\begin{{tabular}}{{{kinds}}}", r"\toprule", head, r"\midrule", *body]
+    return "\n".join([*parts, r"\bottomrule", r"\end{tabular}"]) + "\n"
+
+
 def print_table(rows: Rows, columns: Columns, title: str = "") -> None:
     """Print rows as a table: numbers right-aligned, no heading line if all headings are "".
 

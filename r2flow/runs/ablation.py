@@ -2,19 +2,19 @@
 
 The seconds of a training step are measured once for each combination, which gives its number of
 steps. A run of as many steps resumes bit for bit and ends with a learning rate of 0, which a run
-stopped by the clock would not.
+stopped by the clock would not. A combination that is a chain, as experiment=r2flow, shares its
+seconds between its links, in proportion to their trainer.max_steps; its pairs are part of them.
 """
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import compress, product
 from pathlib import Path
 from statistics import median
 
-import lightning as L
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -24,10 +24,11 @@ from r2flow.base.errors import InputError, naming
 from r2flow.base.files import read_json, write_file
 from r2flow.callbacks import ReflowPairs
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.options import SIMULATED
-from r2flow.generators import as_flow
+from r2flow.data.options import PAIRS, SIMULATED
+from r2flow.model.config import RunConfig
 from r2flow.model.paths import find_checkpoint
 from r2flow.model.tensor_files import read_checkpoint
+from r2flow.runs.chain import Link, check_links, links_of
 from r2flow.runs.composing import compose
 from r2flow.runs.folder import has_ended
 from r2flow.runs.launch import job_folder
@@ -36,6 +37,7 @@ from r2flow.training import Run, build, fit
 _PLAN = "plan.json"
 _HELD_OUT = "simulated:1000"  # a seed that no run trains on
 _TRIAL = 12  # steps that measure the seconds of one
+_PAIRS = 64  # pairs that measure the seconds of one
 _LENGTHS = ("max_steps", "val_check_interval")
 _RESERVED = ("seed", "run_dir", "name", "chain", "preview")
 # Of every run, unless the command line says otherwise.
@@ -47,15 +49,16 @@ _DEFAULTS = (
 )
 
 
-class Clock(L.Callback):
-    """Seconds of training steps; checkpoints keep those of the whole run.
+class Clock(ReflowPairs):
+    """Seconds of training steps and of drawing pairs; checkpoints keep those of the whole run.
 
     They are those of the processor divided by the threads, which other programs do not change, or
     on other devices those of the clock.
     """
 
     def __init__(self) -> None:
-        self.seconds: list[float] = []
+        self.seconds: list[float] = []  # of the steps of this process
+        self.drawing = 0.0  # of the pairs drawn by this process
         self.total = 0.0
         self.images = 0
         self._begin = 0.0
@@ -66,6 +69,13 @@ class Clock(L.Callback):
     def load_state_dict(self, state):
         self.total = state["seconds"]
         self.images = state["images"]
+
+    def setup(self, trainer, pl_module, stage):
+        device = trainer.strategy.root_device
+        begin = _now(device)
+        super().setup(trainer, pl_module, stage)
+        self.drawing += _now(device) - begin
+        self.total = self.drawing
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx):
         self._begin = _now(module.device)
@@ -134,9 +144,20 @@ class Ablation:
         return ", ".join(one.key_or_group for one in self._parsed if one.is_sweep_override())
 
     @property
+    def of_systems(self) -> bool:
+        """Whether it compares experiments, each with its own samplers."""
+        return "experiment" in self.swept.split(", ")
+
+    @property
+    def settings(self) -> str:
+        """The other keys."""
+        fixed = [str(one.input_line) for one in self._parsed if not one.is_sweep_override()]
+        return " ".join([self.swept, *fixed])
+
+    @property
     def seconds(self) -> float:
-        """Seconds of training of each run."""
-        return self.budget / (len(self.variants) * self.seeds)
+        """Seconds of training of each run, with the digits of the table."""
+        return float(f"{self.budget / (len(self.variants) * self.seeds):.6g}")
 
     def simulated(self) -> str:
         """Held-out simulated scans for runs on simulated scans; others have to be named."""
@@ -146,91 +167,112 @@ class Ablation:
         return _HELD_OUT
 
     @cached_property
-    def runs(self) -> dict[str, list[Path]]:
-        """Run folders of each combination, one for each seed."""
+    def runs(self) -> dict[tuple[int, str], list[Link]]:
+        """The links of each seed and combination: one, or those of a chain. An ablation that is
+        stopped has whole seeds.
+        """
         return {
-            name: [
-                self.out / job_folder([*self.keys, "seed=0,1"], ",".join([*own, f"seed={seed}"]))
-                for seed in range(self.seeds)
-            ]
-            for name, own in self.variants.items()
+            (n, name): self._links(n, name) for n in range(self.seeds) for name in self.variants
         }
 
-    def train(self) -> bool:
-        """Train the runs that have not ended; False if `trainer.max_time` has stopped one.
+    def _links(self, seed: int, name: str) -> list[Link]:
+        links = self._changed(seed, name)
+        if links[0].name:
+            with naming(name):
+                check_links(links)
+        return links
+
+    def _changed(self, seed: int, name: str, link: str = "", *keys: str) -> list[Link]:
+        """The links of a run, one of them with further keys."""
+        own = [*self.variants[name], f"seed={seed}"]
+        folder = self.out / f"{self.seconds:g}s"
+        folder /= job_folder([*self.keys, "seed=0,1"], ",".join(own))
+        given = [*_DEFAULTS, *own]
+        with naming(name):
+            chain = compose(given)["chain"]
+            if chain is not None:
+                return links_of(chain, folder, [*given, *(f"+chain.{link}.{k}" for k in keys)])
+            given += [*keys, override("run_dir", str(folder))]
+            return [Link("", RunConfig.of(compose(given)), tuple(given))]
+
+    def check(self) -> None:
+        """Refuse what a run of the first seed would refuse, before any is trained."""
+        for name in self.variants:
+            with naming(name):
+                first = self.runs[0, name][0]
+                if not first.name:
+                    self._build(first)
+
+    def first(self) -> Run:
+        """The first run, untrained, with its training scans in memory."""
+        run = self._build(next(iter(self.runs.values()))[0])
+        run.data.read()
+        return run
+
+    def train(self, seed: int, name: str) -> bool:
+        """Train a run, or the links of its chain; False if `trainer.max_time` has stopped it.
 
         Raises:
-            InputError: the folder holds another ablation, or what a run refuses.
+            InputError: what the run refuses.
         """
-        steps = self._plan()
-        count = len(self.variants) * self.seeds
-        number = 0
-        for seed in range(self.seeds):  # a stopped ablation has whole seeds
-            for name, own in self.variants.items():
-                number += 1
-                run = self.runs[name][seed]
-                if has_ended(run):
-                    continue
-                length = []
-                if steps is not None:  # validated at the end alone
-                    length = [f"trainer.{key}={steps[name]}" for key in _LENGTHS]
-                print(f"[{number}/{count}] {name}, seed {seed}: {run}", flush=True)
-                if not self._fit(name, [*length, *own], seed, run):
+        links = self.runs[seed, name]
+        total = sum(link.config.trainer.max_steps for link in links)
+        for number, link in enumerate(links):
+            if has_ended(link.config.run_dir):
+                continue
+            with naming(f"{name} {link.name}".strip()):
+                if not any(one.key_or_group == "trainer.max_steps" for one in self._parsed):
+                    share = link.config.trainer.max_steps / total
+                    steps = self._steps(seed, name, number, self.seconds * share)
+                    lengths = [f"trainer.{key}={steps}" for key in _LENGTHS]  # validated at the end
+                    link = self._changed(seed, name, link.name, *lengths)[number]
+                run = self._build(link)
+                run.trainer.callbacks.insert(0, Clock())  # type: ignore[attr-defined]
+                if not fit(run).finished:
                     return False
         return True
 
-    def _fit(self, name: str, own: Sequence[str], seed: int, folder: Path) -> bool:
-        with naming(name):
-            run = self._build(own, seed, folder)
-            run.trainer.callbacks.append(Clock())  # type: ignore[attr-defined]
-            return fit(run).finished
-
-    def _build(self, own: Sequence[str], seed: int, folder: Path) -> Run:
-        given = [*_DEFAULTS, *own, f"seed={seed}", override("run_dir", str(folder))]
-        run = build(compose(given), given)
+    def _build(self, link: Link) -> Run:
+        run = build(link.config, link.asked)
         if self._data is not None and self._data.described() == run.data.described():
             run.data = self._data  # with the scans that it has read
         self._data = run.data
         return run
 
-    def _plan(self) -> Mapping[str, int] | None:
-        """Steps of each combination, from the folder's plan or measured now; None: as given."""
-        path = self.out / _PLAN
-        given = {"keys": list(self.keys), "seeds": self.seeds, "budget": self.budget}
-        if path.is_file():
-            plan = read_json(path)
-            if plan["given"] != given:
-                raise InputError(
-                    f"{self.out} holds another ablation: give its command again "
-                    f"({' '.join(plan['given']['keys'])}), or another folder by --out."
-                )
-            return plan["steps"]
-        for name, own in self.variants.items():
-            with naming(name):
-                run = self._build(own, 0, self.runs[name][0])
-                as_flow(run.stage.generator, "an ablation", distilled=True)
-        steps = None
-        if not any(one.key_or_group == "trainer.max_steps" for one in self._parsed):
-            steps = {name: self._steps(name) for name in self.variants}
-        write_file(path, json.dumps({"given": given, "steps": steps}, indent=1))
+    def _steps(self, seed: int, name: str, number: int, seconds: float) -> int:
+        """Steps of a link in as many seconds; as measured before by the plan."""
+        path = self.out / f"{self.seconds:g}s" / _PLAN
+        plan = read_json(path) if path.is_file() else {}
+        place = ", ".join([name, *self.runs[seed, name][number].name.split()])
+        if place not in plan:
+            plan[place] = self._measured_steps(seed, name, number, seconds)
+            write_file(path, json.dumps(plan, indent=1))
+        return plan[place]
+
+    def _measured_steps(self, seed: int, name: str, number: int, seconds: float) -> int:
+        """Steps of a link in as many seconds, by a few trial steps and, in a chain, pairs."""
+        link = self.runs[seed, name][number]
+        trial = [f"trainer.fast_dev_run={_TRIAL}"]
+        paired = link.parent is not None and link.config.data.name == PAIRS
+        if paired:
+            trial += [f"data.pairs.num={_PAIRS}", f"data.pairs.batch_size={_PAIRS}"]
+            # links that share pairs share no trial's
+            trial.append(override("data.root", f"{link.config.run_dir}-trial"))
+        run = self._build(self._changed(seed, name, link.name, *trial)[number])
+        clock = Clock()
+        run.trainer.callbacks.append(clock)  # type: ignore[attr-defined]
+        fit(run)
+        step = median(clock.seconds[2:]) * run.trainer.accumulate_grad_batches
+        print(f"{name} {link.name}: {run.data.batch_size / step:.1f} images/s", flush=True)
+        steps = max(round(seconds / step), 1)
+        if paired:
+            longer = self._changed(seed, name, link.name, f"trainer.max_steps={steps}")[number]
+            drawing = longer.config.data.pairs.num * clock.drawing / _PAIRS
+            steps = max(round(steps * seconds / (steps * step + drawing)), 1)
         return steps
 
-    def _steps(self, name: str) -> int:
-        """Steps in the seconds of a run, by the median of a few."""
-        trial = [f"trainer.fast_dev_run={_TRIAL}", *self.variants[name]]
-        run = self._build(trial, 0, self.runs[name][0])
-        clock = Clock()
-        run.trainer.callbacks += [ReflowPairs(), clock]  # type: ignore[attr-defined]
-        fit(run)
-        seconds = median(clock.seconds[2:]) * run.trainer.accumulate_grad_batches
-        print(f"{name}: {run.data.batch_size / seconds:.1f} images/s in training", flush=True)
-        return max(round(self.seconds / seconds), 1)
 
-
-def training_cost(run: Path) -> dict[str, float]:
-    """Seconds and images a second of a run's training, by its last checkpoint."""
+def training_cost(run: str) -> dict[str, float]:
+    """Seconds and images of a run's training, by its last checkpoint."""
     clock = read_checkpoint(find_checkpoint(run))["callbacks"]["Clock"]
-    return {
-        "images/s in training": clock["images"] / clock["seconds"],
-        "seconds of training": clock["seconds"],
-    }
+    return {"seconds of training": clock["seconds"], "images": clock["images"]}

@@ -168,7 +168,7 @@ def choices(group: str) -> list[str]:
     return [name for name in names if name != "base"]
 
 
-def register_resolver(name: str, resolver: Callable[[str], str]) -> None:
+def register_resolver(name: str, resolver: Callable[..., Any]) -> None:
     """Make `${name:ARGUMENT}` known to configs.
 
     omegaconf 2.4 warns that its function has a new name, which in 2.3 is that of another.
@@ -178,6 +178,8 @@ def register_resolver(name: str, resolver: Callable[[str], str]) -> None:
 
 
 register_resolver("choices", lambda group: ", ".join(choices(group)))  # for --help
+# Of the images of a run: ${part:32,STEPS,BATCH} is one in 32, and at least one.
+register_resolver("part", lambda n, steps, batch: max(int(steps * batch / n), 1))
 
 
 def as_hydra_takes(overrides: Sequence[str]) -> list[str]:

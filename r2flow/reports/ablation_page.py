@@ -1,0 +1,168 @@
+"""Page of an ablation: distance against the time of a scan, as tables and a figure.
+
+Two combinations differ if their intervals of mean +- 2 standard errors do not overlap.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from statistics import fmean, stdev
+
+from matplotlib.figure import Figure
+
+from r2flow.metrics.things import LINES
+from r2flow.reports.pages import Page, Plot, lines_figure
+from r2flow.reports.tables import Row, table
+
+DISTANCE = "distance of ranges"
+COLUMNS = {
+    "combination": "combination",
+    "model": "model",
+    "sampler": "sampler",
+    "evaluations": "evaluations",
+    "seconds a scan": "s a scan",
+    "MiB": "MiB",
+    "shown": "distance",
+    "jsd": "JSD",
+    "mmd": "MMD",
+    "kid_handcrafted_range": "KID",
+    "frechet_handcrafted_range": "Fréchet",
+    **{line: line for line in LINES},
+    "copies": "copies",
+    "error of x_1, t = 0.5": "error of x_1",
+    "parameters, millions": "M parameters",
+    "GMAC": "GMAC",
+    "images": "images",
+}
+RULE = (
+    "Distance: the panel's mean without reflectance, which some systems do not draw, ± 2 standard "
+    "errors: over the seeds, or of one seed over its samples. KID, Fréchet: of features of ranges. "
+    "Copies: median distance to the nearest training scan. Error of x_1: at t = 0.5. Seconds and "
+    "peak memory of drawing: batches of 8. Ahead, behind: the intervals do not overlap."
+)
+_AS_FAST = 1.1  # largest ratio of equal seconds a scan
+
+Systems = Mapping[str, Sequence[Row]]  # rows of each combination
+
+
+def over_seeds(rows: Iterable[Row]) -> list[Row]:
+    """One row for each sampler of each model: means, and the error of the mean over the seeds."""
+    groups: dict[tuple, list[Row]] = {}
+    for row in rows:
+        key = tuple(row.get(k) for k in ("combination", "model", "sampler", "evaluations"))
+        groups.setdefault(key, []).append(row)
+    means = []
+    for group in groups.values():
+        numbers = [key for key, value in group[0].items() if isinstance(value, int | float)]
+        mean = group[0] | {key: fmean(row[key] for row in group) for key in numbers}
+        if len(group) > 1:
+            mean["error"] = stdev(row[DISTANCE] for row in group) / math.sqrt(len(group))
+        means.append(mean | {"shown": f"{mean[DISTANCE]:.3f} ± {2 * mean['error']:.3f}"})
+    return means
+
+
+def frontier(rows: Iterable[Row]) -> list[Row]:
+    """The rows nearer than every faster one, by their seconds a scan."""
+    kept: list[Row] = []
+    for row in sorted(rows, key=lambda row: row["seconds a scan"]):
+        if not kept or row[DISTANCE] < kept[-1][DISTANCE]:
+            kept.append(row)
+    return kept
+
+
+def verdict(ours: Row, other: Row) -> str:
+    """Whether one row is ahead of another, level or behind."""
+    difference = other[DISTANCE] - ours[DISTANCE]
+    if abs(difference) <= 2 * (ours["error"] + other["error"]):
+        return "level"
+    return "ahead" if difference > 0 else "behind"
+
+
+def _against(ours: Row, rows: Sequence[Row]) -> str:
+    """The verdict against another's best row that is as fast, else against its fastest one."""
+    fast = [r for r in rows if r["seconds a scan"] <= _AS_FAST * ours["seconds a scan"]]
+    other = frontier(fast or rows)[-1 if fast else 0]
+    return f"{verdict(ours, other)} ({'' if fast else 'slower, '}{other[DISTANCE]:.3f})"
+
+
+def compared(systems: Systems) -> list[Row]:
+    """The best row of the first combination in each number of evaluations against the others at
+    equal seconds a scan.
+    """
+    first, *others = systems
+    found = []
+    for count in sorted({row["evaluations"] for row in systems[first]}):
+        rows = [row for row in systems[first] if row["evaluations"] == count]
+        best = min(rows, key=lambda row: row[DISTANCE])
+        row = {"in": f"{count:g}", "model": best["model"], first: best["shown"]}
+        found.append(row | {name: _against(best, systems[name]) for name in others})
+    return found
+
+
+def ablation_page(
+    rows: Sequence[Row], names: Sequence[str], budget: float, about: str, device: str
+) -> Page:
+    """Build the page of the stored rows of these combinations; the table and the figure are of one
+    budget.
+
+    The training scans are the table's first row, the best baseline is its last one.
+    """
+    references = over_seeds(row for row in rows if not row["budget"])
+    last = min(references[1:], key=lambda row: row[DISTANCE])
+    systems: dict[str, list[Row]] = {}
+    learned: dict[str, Row] = {}
+    for name in names:
+        own = [row for row in rows if row["combination"] == name]
+        systems[name] = over_seeds(row for row in own if row["budget"] == budget)
+        learned[name] = {"combination": name}
+        for seconds in sorted({row["budget"] for row in own}):
+            distances = [row[DISTANCE] for row in own if row["budget"] == seconds]
+            learned[name][f"{seconds / 60:.3g} min"] = min(distances)
+    lines = [references[0], *(row for each in systems.values() for row in each), last]
+    against = compared(systems)
+    headings = {key: key for row in learned.values() for key in row}
+    text = [
+        f"{next(iter(systems))} at equal seconds a scan, by network evaluations:",
+        table(against, {key: key for key in against[0]}),
+        f"Smallest distance by training time; {last['combination']}: {last[DISTANCE]:.3f}.",
+        table(list(learned.values()), headings),
+        about,
+        table(lines, COLUMNS),
+        RULE,
+    ]
+    figures = {"ablation": _figure(systems, [references[0], last])}
+    return Page("ablation", "Equal training time", text, lines, figures, {}, device)
+
+
+def _figure(systems: Systems, references: Sequence[Row]) -> Figure:
+    """Distance against seconds and, of backbones, GMAC a scan: all rows as points with bars, those
+    that no faster one beats as a line.
+    """
+    axes = {"seconds a scan": lambda row: row["seconds a scan"]}
+    if all(row.get("GMAC") for rows in systems.values() for row in rows):
+        axes["GMAC a scan"] = lambda row: row["GMAC"] * row["evaluations"]
+    best = {name: frontier(rows) for name, rows in systems.items()}
+    plots = []
+    for label, x in axes.items():
+        lines = {n: ([*map(x, rows)], [r[DISTANCE] for r in rows]) for n, rows in best.items()}
+        plots.append(Plot(label, "distance", lines, log_x=True))
+    figure = lines_figure(plots, 2)
+    for panel, x in zip(figure.axes, axes.values(), strict=True):
+        panel.set_yscale("log")
+        for line, rows in zip([*panel.lines], systems.values(), strict=True):
+            style: Row = {
+                "fmt": line.get_marker(),
+                "color": line.get_color(),
+                "ms": 3,
+                "alpha": 0.5,
+            }
+            bars = [2 * row["error"] for row in rows]
+            panel.errorbar([*map(x, rows)], [row[DISTANCE] for row in rows], bars, **style)
+        for row in references:
+            panel.axhline(row[DISTANCE], color="0.4", lw=0.8, ls=":")
+            panel.annotate(
+                row["combination"],
+                (1, row[DISTANCE]),
+                xycoords=("axes fraction", "data"),
+                ha="right",
+            )
+    return figure
