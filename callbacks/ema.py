@@ -46,7 +46,8 @@ class EMA(WeightAveraging):
         self.decay = decay
         self.every = every
         self.warmup_steps = warmup_steps
-        self._decay_at = DECAYS[rule]
+        DECAYS[rule]  # refuses an unknown name
+        self.rule = rule  # a function without a name cannot be pickled
         self._step = 0
         self._end: float = -1
         self._copies = False
@@ -54,7 +55,7 @@ class EMA(WeightAveraging):
     def _decay(self) -> float:
         """Decay after step `_step`, counted from 0."""
         n = self._step + 1 - (self.warmup_steps or 0)
-        return 0.0 if self._copies or n < 1 else min(self.decay, self._decay_at(n))
+        return 0.0 if self._copies or n < 1 else min(self.decay, DECAYS[self.rule](n))
 
     def _average(self, average: Tensor, weight: Tensor, updates: Any) -> Tensor:
         return average.lerp(weight, 1 - self._decay())

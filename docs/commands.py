@@ -68,6 +68,8 @@ def check(words: list[str]) -> None:
     overrides = [one for one in given.overrides if not one.startswith("hydra")]
     if given.m:  # the first job of the sweep
         overrides = [re.sub(r"^([\w.]+=[\w.]+)(,[\w.]+)+$", r"\1", one) for one in overrides]
+        interval = r"=(?:tag\(\w+, )?interval\(([^,]+),.*"
+        overrides = [re.sub(interval, r"=\1", one) for one in overrides]
     if plugins:  # whose choices are theirs
         overrides = [one for one in overrides if not re.match(r"(backbone|stage|data)=", one)]
     compose(overrides, [DOCS.parent / given.config_dir] if given.config_dir else [])

@@ -8,7 +8,10 @@ Notation everywhere: `t = 0` is noise and `t = 1` is data; `x_0 ~ N(0, I)`, `x_1
     scan = r2flow.read("000000.bin", "vlp16")  # a scan file as such an image, (2, H, W)
 """
 
+import sys
 from importlib import import_module
+from importlib.machinery import ModuleSpec
+from importlib.util import spec_from_file_location
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
@@ -25,9 +28,24 @@ if TYPE_CHECKING:
 
 __version__ = "0.2.0"
 
-# The folders callbacks/ and conf/ of a checkout lie beside this package; a wheel has them in it.
+
+class _Beside:
+    """Finds r2flow.callbacks and r2flow.conf in a checkout, beside this package; a wheel has them
+    in it.
+    """
+
+    @staticmethod
+    def find_spec(name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        if name not in ("r2flow.callbacks", "r2flow.conf"):
+            return None
+        folder = Path(__file__).parents[1] / name.removeprefix("r2flow.")
+        return spec_from_file_location(
+            name, folder / "__init__.py", submodule_search_locations=[str(folder)]
+        )
+
+
 if not Path(__file__).with_name("conf").is_dir():
-    __path__.append(str(Path(__file__).parents[1]))
+    sys.meta_path.append(_Beside)
 
 # Imported at their first use, so that `import r2flow` is fast.
 _PLACES = {

@@ -11,12 +11,14 @@ the recipe and a checksum. Files are written under a temporary name and renamed 
 that a killed command can resume.
 """
 
+import fcntl
 import hashlib
 import json
 import logging
 import math
 import os
 import time
+import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
@@ -29,7 +31,7 @@ from safetensors.numpy import save
 
 from r2flow.base.config import at_most_three, differences
 from r2flow.base.errors import InputError
-from r2flow.base.files import read_json, write_file
+from r2flow.base.files import clear_leftovers, locked, read_json, write_file
 from r2flow.base.hashing import state_hash
 from r2flow.base.pool import attempts_of
 from r2flow.base.registry import Config, Options
@@ -38,7 +40,6 @@ from r2flow.lidar.scan_files import FIRM_ENDINGS
 log = logging.getLogger(__name__)
 
 MANIFEST = "manifest.json"
-_STALE = 3600  # seconds after which a temporary file counts as abandoned
 _PATIENCE = 0.2  # seconds between polls of items that other processes make
 QUIET = 20.0  # seconds of waiting before a log message
 
@@ -63,19 +64,20 @@ class Store:
         self.kind = kind
         self.described: Config = json.loads(json.dumps(recipe))
         self.digest = checksum(self.described)
+        self._held: int | None = None  # descriptor of the claimed folder
 
     def files(self, item: int) -> list[Path]:
         return [self.folder / f"{self.kind}-{item:06d}.safetensors"]
 
-    def check(self) -> bool:
+    def check(self, claimed: bool = False) -> bool:
         """Whether the folder has a manifest; refuses a folder with scans, or with anything of
-        another recipe.
+        another recipe, if `claimed` also its manifest alone.
         """
         if (self.folder / MANIFEST).is_file():
             recipe = read_manifest(self.folder, self.kind)["recipe"]
             other = [*differences(recipe, self.described).values()]
             if other:
-                if len(os.listdir(self.folder)) == 1:
+                if not claimed and len(os.listdir(self.folder)) == 1:
                     return False  # its command was refused before it made anything
                 raise InputError(
                     f"{self.folder} holds other "
@@ -92,15 +94,22 @@ class Store:
         return False
 
     def begin(self, **notes: Any) -> None:
-        """Write the manifest if it is missing: the recipe and `notes`."""
-        if not self.check():
+        """Claim the folder for the recipe: write the manifest, with `notes`, if it is missing.
+
+        Processes of the recipe share a lock of the folder while they live; the manifest of another
+        recipe is replaced by a process that has the folder alone, if nothing was made by it.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        clear_leftovers(self.folder)
+        if self._held is None:
+            self._held = os.open(self.folder, os.O_RDONLY)
+            weakref.finalize(self, os.close, self._held)
+        alone = locked(self._held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if alone and not self.check():
             self.write_manifest(**notes)
-            self.check()  # another process may have taken the folder in between
-        # of killed writers
-        for leftover in (*self.folder.glob(".*.part"), *self.folder.glob(".*.lock")):
-            with suppress(FileNotFoundError):
-                if time.time() - leftover.stat().st_mtime > _STALE:
-                    leftover.unlink()
+        locked(self._held, fcntl.LOCK_SH)
+        if not self.check(claimed=True):  # its process has ended, or a disk without locks
+            self.write_manifest(**notes)
 
     def write_manifest(self, **notes: Any) -> None:
         """Write or overwrite the manifest: the recipe and `notes`."""
@@ -232,7 +241,6 @@ class Store:
         lock = FileLock(path, timeout=0)
         try:
             lock.acquire()
-            self.check()  # another command may have taken the folder, which held the manifest alone
             if not self.has(item):
                 work(item)
         except Timeout:

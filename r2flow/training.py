@@ -22,8 +22,15 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.utilities.model_helpers import is_overridden
 
 from r2flow.base.config import as_override
-from r2flow.base.errors import InputError, check_folder, one_line
-from r2flow.base.signals import LATER, STOPPING, Stopped, handling_signals
+from r2flow.base.errors import InputError, one_line
+from r2flow.base.files import check_folder
+from r2flow.base.signals import (
+    LATER,
+    STOPPING,
+    Stopped,
+    handling_signals,
+    stop_with_torchrun,
+)
 from r2flow.callbacks.loggers import log_config
 from r2flow.callbacks.stopping import Stopping
 from r2flow.model.config import RunConfig
@@ -71,6 +78,7 @@ def fit(run: Run) -> Result:
         (callback for callback in callbacks if isinstance(callback, Stopping)), Stopping()
     )
     stopping.run_dir = run.folder
+    stop_with_torchrun()
     first = run.trainer.is_global_zero
     with stopping.handling_signals(), quiet(repeated=False):  # each trains on scans of its own
         if run.config.trainer.fast_dev_run:

@@ -3,6 +3,7 @@
 import copy
 import json
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from torch.utils.data import DataLoader
 import r2flow
 from r2flow import Distill, Rectify, Reflow, ScanDataModule
 from r2flow.base.errors import InputError
+from r2flow.lidar.sensors import SENSORS
 from tests.conftest import ROOT, quiet_trainer
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*")
@@ -418,3 +420,46 @@ def test_processes_measure_as_one(tmp_path: Path, devices: int, scenes: int):
     for one in shared:
         # the weights differ by the order of sums
         assert one[:2] == [pytest.approx(loss, rel=1e-5), pytest.approx(panel, abs=1e-5)]
+
+
+class Saving(Rectify):
+    def __init__(self, extra: int = 3, **options) -> None:
+        super().__init__(**options)
+        self.save_hyperparameters()
+
+
+def test_a_stage_that_saves_its_arguments_again_is_loaded(tmp_path: Path):
+    trainer = quiet_trainer(tmp_path, max_steps=1)
+    trainer.fit(
+        Saving(extra=5, backbone=BACKBONE, sensor=SENSORS["hdl64e"].resized(8, 64)), scans()
+    )
+    trainer.save_checkpoint(tmp_path / "a.ckpt")
+    loaded = Saving.load_from_checkpoint(tmp_path / "a.ckpt", weights_only=True)
+    assert loaded.hparams.extra == 5
+    expected = loaded.sample(1)
+    torch.testing.assert_close(r2flow.load(tmp_path / "a.ckpt").sample(1), expected)
+
+
+def test_an_average_is_pickled():
+    average = pickle.loads(pickle.dumps(EMA(rule="ratio")))
+    average._step = 9
+    assert average._decay() == (1 + 10) / (10 + 10)
+
+
+@pytest.mark.parametrize("callback", [ModelCheckpoint, EarlyStopping])
+def test_a_monitor_of_another_name_is_answered_before_training(tmp_path: Path, callback):
+    trainer = quiet_trainer(
+        tmp_path, max_steps=1, callbacks=[callback(monitor="val_loss")], enable_checkpointing=True
+    )
+    with pytest.raises(InputError, match=r"monitors 'val_loss'.*Did you mean 'val/loss'\?"):
+        trainer.fit(flow(), scans())
+
+
+def test_a_folder_is_no_kind_of_scans(tmp_path: Path):
+    with pytest.raises(InputError, match="is a folder: give 'folder', or its kind, and root="):
+        ScanDataModule(str(tmp_path))
+
+
+def test_a_test_of_a_few_scans_says_so(tmp_path: Path, caplog):
+    quiet_trainer(tmp_path).test(flow(sampler={"steps": 1}), scans(), verbose=False)
+    assert "2 held-out scans are too few" in caplog.text

@@ -5,6 +5,7 @@ import io
 import logging
 import os
 import re
+import reprlib
 import sys
 import unicodedata
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from typing import Any
 
 log = logging.getLogger(__name__)
 
+_LONGEST = 4000  # characters of a message
 IN_MEMORY = "points in memory"  # the name of points without a file
 
 
@@ -32,6 +34,16 @@ def check(holds: object, message: str) -> None:
         raise InputError(message)
 
 
+_short = reprlib.Repr()
+_short.maxstring = _short.maxother = 120
+_short.maxlong = 40
+
+
+def quoted(value: object) -> str:
+    """A value of the user in a message, cut: those of files can be of any size."""
+    return _short.repr(value)[:200]
+
+
 def require(what: str, extra: str, *packages: str) -> None:
     """Raise InputError with the extra to install if a package is missing."""
     for package in packages:
@@ -39,17 +51,6 @@ def require(what: str, extra: str, *packages: str) -> None:
             find_spec(package),
             f"{what} needs the package {package}: python -m pip install 'r2flow[{extra}]'.",
         )
-
-
-def check_folder(folder: Path) -> None:
-    """Refuse a folder that cannot be written to or created, before any work; with a manifest it may
-    be complete.
-    """
-    there = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
-    usable = there.is_dir() and (
-        (folder / "manifest.json").is_file() or os.access(there, os.W_OK | os.X_OK)
-    )
-    check(usable, f"{there} is not a folder that can be written to; give another one.")
 
 
 # System errors that are no fault of files, disks or limits: they keep their traceback.
@@ -118,7 +119,9 @@ def explain_mistake(error: InputError | OSError) -> str:
 
 
 def one_line(text: str) -> str:
-    """Make a text with file names one printable line."""
+    """Make a text with file names one printable line, cut in the middle if it is very long."""
+    if len(text) > _LONGEST:
+        text = f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
     return printable("\\n".join(text.strip().splitlines()))
 
 
@@ -150,6 +153,17 @@ class Unbroken(io.FileIO):
             return len(data)
 
 
+# Of names, in results: sequences that a terminal obeys, but for rich's colours.
+_OBEYED = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1a\x1c-\x1f\x7f-\x9f]|\x1b(?!\[[\d;]*m)")
+
+
+class Harmless(io.TextIOWrapper):
+    """A text stream that escapes control characters, but for line ends and colours."""
+
+    def write(self, text: str) -> int:
+        return super().write(_OBEYED.sub(lambda found: printable(found[0]), text))
+
+
 def open_streams() -> None:
     """Make standard output and error accept any file name, outlive their reader, exist in a daemon
     and have a width.
@@ -164,5 +178,6 @@ def open_streams() -> None:
             stream.flush()
             raw = io.BufferedWriter(Unbroken(stream.fileno(), "w", closefd=False))
             lines = name == "stderr" or stream.isatty()
-            text = io.TextIOWrapper(raw, stream.encoding, "backslashreplace", line_buffering=lines)
+            kind = Harmless if name == "stdout" else io.TextIOWrapper
+            text = kind(raw, stream.encoding, "backslashreplace", line_buffering=lines)
             setattr(sys, name, text)

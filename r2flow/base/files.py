@@ -1,6 +1,7 @@
 """Atomic writing of files, and safe reading of JSON."""
 
 import errno
+import fcntl
 import json
 import os
 import secrets
@@ -10,8 +11,9 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+import yaml
 
-from r2flow.base.errors import InputError, naming
+from r2flow.base.errors import InputError, check, naming
 
 
 @contextmanager
@@ -19,7 +21,8 @@ def atomic_write(path: str | Path) -> Iterator[IO[bytes]]:
     """Open a temporary file that replaces `path` when the block ends without an error.
 
     It is flushed to the disk before the rename and the folder after it: a reader, or a power cut,
-    finds the old file or the whole new one. A link stays, and its target is written.
+    finds the old file or the whole new one. A link stays, and its target is written. The temporary
+    file is locked while it is written: `clear_leftovers` removes those of killed processes.
     """
     path = Path(path)
     if path.exists() and not path.is_file():  # the rename would replace a device or a pipe
@@ -30,10 +33,11 @@ def atomic_write(path: str | Path) -> Iterator[IO[bytes]]:
     temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.part"
     try:
         with open(temporary, "xb") as file:
+            locked(file.fileno(), fcntl.LOCK_SH)
             yield file
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, target)
+            os.replace(temporary, target)
         folder = os.open(target.parent, os.O_RDONLY)
         try:
             os.fsync(folder)
@@ -50,6 +54,39 @@ def atomic_write(path: str | Path) -> Iterator[IO[bytes]]:
     finally:
         with suppress(OSError):
             temporary.unlink()
+
+
+def locked(descriptor: int, kind: int) -> bool:
+    """Whether a lock of an open file or folder (`fcntl.flock`) was taken; it ends with its process.
+    Where the file system has no locks, it was.
+    """
+    try:
+        fcntl.flock(descriptor, kind)
+    except BlockingIOError:
+        return False
+    except OSError:  # no locks, as on some network disks
+        return True
+    return True
+
+
+def clear_leftovers(folder: Path) -> None:
+    """Remove temporary files and locks of killed processes from a folder."""
+    for leftover in (*folder.glob(".*.part"), *folder.glob(".*.lock")):
+        with suppress(OSError), open(leftover, "rb") as file:
+            if locked(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB):
+                leftover.unlink()
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that cannot be written to or created, before any work; with a manifest it may
+    be complete. Clears what killed commands left in it.
+    """
+    there = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
+    usable = there.is_dir() and (
+        (folder / "manifest.json").is_file() or os.access(there, os.W_OK | os.X_OK)
+    )
+    check(usable, f"{there} is not a folder that can be written to; give another one.")
+    clear_leftovers(folder)
 
 
 def write_file(path: str | Path, content: str | bytes) -> None:
@@ -72,6 +109,13 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
+
+
+def parse_yaml(text: str) -> Any:
+    """Plain values of a YAML document; InputError: it has aliases, which can stand for any size."""
+    aliases = any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text))
+    check(not aliases, "it has aliases (*NAME), which can stand for any size: write them out.")
+    return yaml.safe_load(text)
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from pydantic import (
 )
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
-from r2flow.base.errors import InputError
+from r2flow.base.errors import InputError, quoted
 
 T = TypeVar("T")
 
@@ -122,7 +122,9 @@ class Registry(Mapping[str, T]):
         if name not in self:
             names = sorted({*self, *presets(self.kind)})
             hint = did_you_mean(str(name), names)
-            raise UnknownName(f"no {self.kind} named {name!r}; known: {', '.join(names)}.{hint}")
+            raise UnknownName(
+                f"no {self.kind} named {quoted(name)}; known: {', '.join(names)}.{hint}"
+            )
         entry: Any = self._entries[name]
         if isinstance(entry, _Lazy):
             found: Any = resolve_name(entry.place)
@@ -169,7 +171,7 @@ class Registry(Mapping[str, T]):
         if not isinstance(chosen, Mapping) or not isinstance(chosen.get("name"), str):
             known = ", ".join(sorted(self))
             raise InputError(
-                f"a {self.kind} config needs a 'name', found {given!r}; known: {known}."
+                f"a {self.kind} config needs a 'name', found {quoted(given)}; known: {known}."
             )
         options = dict(chosen)
         name = options["name"]
@@ -217,7 +219,7 @@ def check_options(
         InputError: an unknown option, a missing one, or a value that does not fit its annotation.
     """
     if not isinstance(options, Mapping):
-        raise InputError(f"{what} must be a group of keys, found {options!r}.")
+        raise InputError(f"{what} must be a group of keys, found {quoted(options)}.")
     with _in_one_line(what, constructor, options, given):
         return _schema(constructor, given).validate_python(dict(options))
 
@@ -310,4 +312,4 @@ def _first_problem(
         options = options[part]
     words = problem["msg"].removeprefix("Value error, ")
     words = words.replace("an instance of Sequence", "a list")
-    return f"{'.'.join(keys)}: {words[:1].lower()}{words[1:]}, found {problem['input']!r}."
+    return f"{'.'.join(keys)}: {words[:1].lower()}{words[1:]}, found {quoted(problem['input'])}."

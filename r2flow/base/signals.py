@@ -126,6 +126,12 @@ def end_with_parent(end: Callable[[], object] = lambda: os._exit(1)) -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
+def stop_with_torchrun() -> None:
+    """Receive SIGTERM when torchrun's agent ends, also if it was killed."""
+    if sys.platform == "linux" and "TORCHELASTIC_RUN_ID" in os.environ:
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
+
+
 @contextmanager
 def blocking_signals() -> Iterator[None]:
     """Start processes that block stop signals; this process hears them after the block."""

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from typer import Argument, Option
 
 from r2flow.base.devices import choose_device
-from r2flow.base.errors import check_folder
+from r2flow.base.files import check_folder
 from r2flow.cli.app import app
 from r2flow.cli.options import SETS, DeviceOption, OutOption, parse_counts, several
 

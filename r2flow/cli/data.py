@@ -133,11 +133,15 @@ def sensor(
     Pass the file to other verbs (--sensor mine.yaml), or place it in conf/sensor/ for train.py
     (sensor=mine).
     """
+    import numpy as np
+
+    from r2flow.base.errors import warn_odd
     from r2flow.base.progress import track
+    from r2flow.data.reading import DARK, is_dark
     from r2flow.data.sources import warn_of_frame
-    from r2flow.lidar.estimation import estimate_sensor, nearest_sensor
+    from r2flow.lidar.estimation import estimate_sensor, hangs, nearest_sensor
     from r2flow.lidar.scan_files import points_beside, read_points
-    from r2flow.lidar.sensors import ENDINGS, SENSORS, write_sensor
+    from r2flow.lidar.sensors import ENDINGS, SENSORS, sensor_yaml, write_sensor
     from r2flow.reports.tables import print_table
     from r2flow.reports.view.panels import list_scans
 
@@ -145,8 +149,6 @@ def sensor(
     if out is not None:
         if out.suffix.lower() not in ENDINGS:
             raise InputError(f"--out must be a .yaml file, as for --sensor; found {out}.")
-        if out.exists():
-            raise InputError(f"{out} exists; give another --out.")
         name = re.sub(r"\W", "_", out.stem, flags=re.ASCII)
         if name in SENSORS or not name[0].isalpha():
             name = f"my_{name}"
@@ -160,7 +162,10 @@ def sensor(
     reflectance = "none: encoding.reflectance=false"
     if scale:
         stored = [one.reflectance for one in points if one.reflectance is not None]
-        beyond = sum((values > 1.001 * scale).sum() for values in stored)
+        values = np.concatenate(stored)
+        beyond = (values > 1.001 * scale).sum()
+        if is_dark(values[values > 0], scale):
+            warn_odd(paths[0], DARK)
         reflectance = f"reflectance_scale={scale:g}; {beyond:,} points beyond are clipped"
     rows = {
         "beams": f"{len(degrees)}: {beams.order}",
@@ -170,12 +175,17 @@ def sensor(
         "resolution": f"{steps:,.0f} steps a turn; images of {mine.columns} columns",
         "range seen": f"{mine.min_range:g} to {mine.max_range:g} m; "
         "raise min_range if the vehicle is visible",
-        "height": f"{mine.height:.2f} m above the ground{'' if ground else ', assumed'}",
+        "height": "not known: the ground lies above the sensor"
+        if hangs(points)
+        else f"{mine.height:.2f} m above the ground{'' if ground else ', assumed'}",
         "reflectance": reflectance,
     }
     print_table(list(rows.items()), ("", ""))
     if out is not None:
-        write_sensor(mine, out, f"Estimated from {len(points)} scan(s), stored {beams.order}.")
+        comment = f"Estimated from {len(points)} scan(s), stored {beams.order}."
+        if out.exists() and out.read_bytes() != sensor_yaml(mine, comment).encode():
+            raise InputError(f"{out} exists, with other content; give another --out.")
+        write_sensor(mine, out, comment)
         print(out)
 
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from typer import Argument, Option
 
 from r2flow.base.devices import choose_device
-from r2flow.base.errors import InputError, check, check_folder
+from r2flow.base.errors import InputError, check
+from r2flow.base.files import check_folder
 from r2flow.cli.app import app
 from r2flow.cli.options import (
     SETS,
@@ -16,6 +17,7 @@ from r2flow.cli.options import (
     ColumnsOption,
     DeviceOption,
     DrawOptions,
+    LabelIdsOption,
     ModelArgument,
     OutOption,
     SamplerOptions,
@@ -88,6 +90,7 @@ def sample(
     labels: Annotated[
         str | None, Option(help="A labelled model that labels the points: NAME.label.")
     ] = None,
+    label_ids: LabelIdsOption = None,
 ) -> None:
     """Sample scans from a trained model (default: `street`): point clouds, range images and
     pictures.
@@ -122,6 +125,7 @@ def sample(
         region,
         precision=precision or usual_precision(loaded.generator, model in (None, DEFAULT)),
         labels=_labelling(labels, loaded) if labels else None,
+        label_ids=label_ids,
     )
     there = len(list(out.glob(f"[0-9]*.{formats[0]}")))
     more = f", next to {there - draw.num} of an earlier command" if there > draw.num else ""
@@ -242,6 +246,7 @@ class PartialOptions:
     ] = None
     reflectance_scale: ScaleChoice = None
     columns: ColumnsOption = None
+    label_ids: LabelIdsOption = None
     scans: Annotated[
         int | None,
         Option(min=1, help="Maximum number of scans per folder, evenly spread. Default: all."),
@@ -276,6 +281,7 @@ class PartialOptions:
             scale=self.reflectance_scale,
             most=self.scans,
             columns=self.columns,
+            label_ids=self.label_ids,
         )
 
 
@@ -326,6 +332,7 @@ def complete(
     """
     from r2flow.lidar.bags import is_recording
     from r2flow.lidar.known import mask_identity, parse_mask
+    from r2flow.lidar.labels import SEMANTIC_KITTI, label_list
     from r2flow.model.completion import completing, usual_precision
     from r2flow.model.shipped import DEFAULT, DENSIFY
     from r2flow.reports.answer_rays import Job, lack_sectors
@@ -341,7 +348,8 @@ def complete(
     check_folder(out)
     mask = parse_mask(given.mask) if given.mask else None
     hidden = frozenset(given.hide or ())
-    job = Job(num, seed, mask, given.fill_gaps, hidden, batch_size, pictures)
+    ids = label_list(given.label_ids or SEMANTIC_KITTI)
+    job = Job(num, seed, mask, given.fill_gaps, hidden, batch_size, pictures, label_ids=ids)
     jumps = how.given.get("name", "jump") in ("jump", "transport")
     name = checkpoint or (DENSIFY if jumps else DEFAULT)
     loaded, scans, remarks = given.open(name, device, what)

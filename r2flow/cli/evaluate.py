@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Argument
 
 from r2flow.base.devices import choose_device
-from r2flow.base.errors import InputError, check, check_folder
+from r2flow.base.errors import InputError, check
+from r2flow.base.files import check_folder
 from r2flow.cli.app import app
 from r2flow.cli.options import SETS, ReadingOptions, grouped
 from r2flow.cli.sets import EvaluateOptions, judged_sets, open_set, possible_metrics, reading_of
@@ -54,17 +55,17 @@ def evaluate(
         check(
             not (options.json or options.out), "miou is printed alone: leave --json and --out out."
         )
-        return _evaluate_labels(real, named)
+        return _evaluate_labels(real, named, (how.label_ids or "semantic_kitti").split(","))
     with process_group(choose_device(options.device)) as device:
         _evaluate(real, named, options, how, device)
 
 
-def _evaluate_labels(real: str, named: Sequence[str]) -> None:
+def _evaluate_labels(real: str, named: Sequence[str], ids: Sequence[str]) -> None:
     from r2flow.reports.labels import label_rows
     from r2flow.reports.tables import print_table
 
     for name in named:
-        rows, calibration = label_rows(real, name)
+        rows, calibration = label_rows(real, name, ids)
         print_table(rows, {"class": "class", "iou": "IoU", "points": "points"}, f"labels of {name}")
         if calibration:
             columns = {"said": "said", "right": "right", "points": "points"}

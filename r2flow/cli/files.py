@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from typer import Argument, Option
 
-from r2flow.base.errors import InputError, check, check_folder
+from r2flow.base.errors import InputError, check
+from r2flow.base.files import check_folder
 from r2flow.cli.app import app
 from r2flow.cli.options import ModelArgument, SamplerOptions, SizeOption, grouped
 

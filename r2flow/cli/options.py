@@ -75,6 +75,15 @@ TopicOption = Annotated[
     str | None, Option(help="Topic of the point clouds of a recording, required if several.")
 ]
 
+LabelIdsOption = Annotated[
+    str | None,
+    Option(
+        help="List of the ids of .label files: semantic_kitti (default), semantic_kitti_learning, "
+        "nuscenes_lidarseg, semantic_poss, rellis_3d, pandaset, or a YAML file of lines `1: car`."
+    ),
+]
+
+
 ModelArgument = Annotated[Path, Argument(help="A model, a run folder or a checkpoint file.")]
 SeedOption = Annotated[
     int, Option(min=0, max=2**64 - 1, help="Scan i depends only on the seed and i.")
@@ -154,6 +163,7 @@ class ReadingOptions:
     ] = None
     reflectance_scale: ScaleChoice = None
     columns: ColumnsOption = None
+    label_ids: LabelIdsOption = None
 
     def reading(
         self,

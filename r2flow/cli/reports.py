@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Argument, Option
 
 from r2flow.base.devices import choose_device
-from r2flow.base.errors import InputError, check_folder
+from r2flow.base.errors import InputError
+from r2flow.base.files import check_folder
 from r2flow.cli.app import app, report
 from r2flow.cli.options import (
     SETS,

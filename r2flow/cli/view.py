@@ -54,7 +54,7 @@ def show(
     """Draw each scan (range, reflectance, bird's-eye view, perspective) as a PNG or PDF, or write
     range images.
     """
-    from r2flow.base.files import save_array
+    from r2flow.base.files import check_folder, save_array
     from r2flow.data.opening import describe
     from r2flow.reports.pictures import STREET, save_figure, scan_figure, view_of
     from r2flow.reports.view.panels import scan_panels, share_scale
@@ -63,6 +63,7 @@ def show(
         describe(spec).options.folder.resolve() for spec in scans
     }:
         raise InputError(f"{out} is the folder of the scans; give another --out.")
+    check_folder(out)
     names: set[str] = set()
     readings = {spec: how.reading([spec], estimate=True) for spec in scans}
     panels = [panel for _, panel in scan_panels(share_scale(readings, most), most)]

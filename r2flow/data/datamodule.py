@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import lightning as L
@@ -28,8 +29,9 @@ from r2flow.data.loader import (
     Permutations,
     RunSampler,
 )
-from r2flow.data.opening import Described
+from r2flow.data.opening import SOURCES, Described
 from r2flow.data.options import (
+    MIXED,
     PAIRS,
     SIMULATED,
     DataOptions,
@@ -111,6 +113,8 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
         super().__init__()
         options = {one.name: arguments[one.name] for one in fields(DataOptions)}
         given = {key: value for key, value in options.items() if value is not None}
+        if name not in (MIXED, PAIRS) and name not in SOURCES and Path(name).expanduser().is_dir():
+            raise InputError(f"{name} is a folder: give 'folder', or its kind, and root={name!r}.")
         self.options = construct("data", DataOptions, given)
         self.seed = seed
         self.batch_size = self.options.batch_size

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from r2flow.base.errors import InputError, warn_odd
 from r2flow.data.options import SourceOptions
-from r2flow.data.reading import Reading, lacks_reflectance, leaving_out
+from r2flow.data.reading import Reading, labelled, lacks_reflectance, leaving_out
 from r2flow.data.sources import ScanFiles, ScanSource, warn_of_other_sensor
 from r2flow.lidar.scan_files import (
     FIRM_ENDINGS,
@@ -168,6 +168,8 @@ class Layout(SourceKind):
         if self.splits:
             about["split"] = options.split or "all"
         warn_of_other_sensor(scans.paths, reading, options.folder, scans.made_here)
+        if reading.labels and not labelled(scans.paths):
+            raise InputError(f"{options.folder}: no scan has labels, as 000000.label beside it.")
         return ScanFiles(scans.paths, reading, options.folder, drives, about)
 
     def lacks_reflectance(self, scans: "Described", on_bad_scan: str = "error") -> str | None:

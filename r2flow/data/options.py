@@ -11,6 +11,7 @@ from r2flow.base.config import Found, Free, Rule
 from r2flow.base.errors import InputError
 from r2flow.base.registry import Count, Natural, NonNegative, Portion, Positive, Seed, strict
 from r2flow.generators.base import Precision
+from r2flow.lidar.labels import SEMANTIC_KITTI, label_list
 from r2flow.lidar.projection import Convention, Projection
 from r2flow.lidar.scan_files import check_columns
 from r2flow.samplers import build_sampler
@@ -38,9 +39,11 @@ class ReadingOptions:
     reflectance_scale: Positive | None = None
     columns: Sequence[str] | None = None
     on_bad_scan: Literal["error", "skip"] | None = None
+    label_ids: str | Mapping[int | str, Any] | None = None  # a `LabelList`: name, file or map
 
     def __post_init__(self) -> None:
         check_columns(self.columns)
+        label_list(self.label_ids or SEMANTIC_KITTI)
 
     @property
     def chosen(self) -> Data:

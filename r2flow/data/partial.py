@@ -131,7 +131,10 @@ def _files(
     full = 1.0
     images = {path for path in paths if path.suffix.lower() == ".npy" and is_image(path)}
     read_image: Callable[[Path], Partial] = partial(
-        read_partial, source=source, target=target, labels=reading.labels
+        read_partial,
+        source=source,
+        target=target,
+        ids=reading.label_ids if reading.labels else None,
     )
     by_points = read_image
     if points := [path for path in paths if path not in images]:
@@ -339,7 +342,7 @@ def _seen(
         raise nothing_in_view(path, points, target)
     file = labels_beside(path) if reading.labels else None
     if file:
-        classes = common_classes(read_labels(file, path, points))
+        classes = common_classes(read_labels(file, path, points, reading.label_ids))
         seen = replace(seen, image=_with_classes(seen, points.xyz, classes))
     r = np.linalg.norm(points.xyz, axis=1)
     inside = (r >= target.min_range) & (r <= target.max_range)

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from r2flow.base.errors import InputError, check
+from r2flow.base.errors import InputError, check, naming
 from r2flow.lidar.encoding import FAR, wrong_with
 from r2flow.lidar.known import Ray
-from r2flow.lidar.labels import common_classes
+from r2flow.lidar.labels import LabelList, common_classes
 from r2flow.lidar.other_sensors import Partial, image_through
 from r2flow.lidar.scan_files import read_numbers, read_range_image
 from r2flow.lidar.sensors import Sensor
@@ -22,27 +22,31 @@ def is_image(path: Path) -> bool:
     return array.ndim == 3 or (array.ndim == 2 and array.dtype.kind in "iu")
 
 
-def _read_labels(path: Path, ids: np.ndarray, target: Sensor) -> Partial:
-    """A map of labels, SemanticKITTI's ids, (H, W), of rays that were not measured."""
-    if ids.shape != target.shape:
+def _read_labels(path: Path, found: np.ndarray, ids: LabelList, target: Sensor) -> Partial:
+    """A map of labels, ids of a list, (H, W), of rays that were not measured."""
+    if found.shape != target.shape:
         size = "x".join(map(str, target.shape))
-        found = "x".join(map(str, ids.shape))
-        raise InputError(f"{path} is a map of labels of {found}, those of the model are {size}.")
+        own = "x".join(map(str, found.shape))
+        raise InputError(f"{path} is a map of labels of {own}, those of the model are {size}.")
     image = np.zeros((3, *target.shape), np.float32)
-    image[2] = common_classes(ids)
+    with naming(path):
+        image[2] = common_classes(ids.semantic(found))
     if not image.any():
         raise InputError(f"{path} has no label: 0 is a ray whose class is not known.")
     return Partial(image, np.full(target.shape, Ray.UNKNOWN, np.uint8))
 
 
-def read_partial(path: Path, source: Sensor | None, target: Sensor, labels: bool) -> Partial:
-    """A range image of floats, (2 or 1, H, W), of a sensor, or with `labels` a map of labels, as a
+def read_partial(
+    path: Path, source: Sensor | None, target: Sensor, ids: LabelList | None
+) -> Partial:
+    """A range image of floats, (2 or 1, H, W), of a sensor, or with `ids` a map of labels, as a
     partially measured image of another one; InputError: it is neither.
     """
     stored = read_numbers(path)
     if stored.ndim == 2:
-        check(labels, f"{path} is a map of labels: give a model with labels, -c labels.")
-        return _read_labels(path, stored, target)
+        if ids is None:
+            raise InputError(f"{path} is a map of labels: give a model with labels, -c labels.")
+        return _read_labels(path, stored, ids, target)
     found = f"found {stored.dtype} {stored.shape}"
     other = f"{path} must be a range image of floats (2 or 1, H, W), {found}."
     check(stored.dtype.kind == "f" and len(stored) in (1, 2) and stored.size, other)

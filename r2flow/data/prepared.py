@@ -4,8 +4,8 @@
     source[0]                       range in metres and reflectance, (2, H, W)
 
 A shard is an item of `r2flow.store`: `range` uint16 (n, H, W) and, if the scans have it,
-`reflectance` uint8 (n, H, W), in the codes of `r2flow.data.quantise`; if each scan has a file of
-labels, `label` uint8 (n, H, W), the common class.
+`reflectance` uint8 (n, H, W), in the codes of `r2flow.data.quantise`; if any scan has a file
+of labels, `label` uint8 (n, H, W), the common class, 0 for none.
 """
 
 import copy
@@ -28,7 +28,7 @@ from r2flow.base.files import reading_errors
 from r2flow.base.progress import Bar, track
 from r2flow.data.layouts import Drive
 from r2flow.data.quantise import OTHER_LEVELS, Codes, find_levels, range_codes, reflectance_codes
-from r2flow.data.reading import Reading, lacks_reflectance, read_image
+from r2flow.data.reading import Reading, labelled, lacks_reflectance, read_image
 from r2flow.data.sources import (
     ScanFiles,
     ScanSource,
@@ -36,8 +36,6 @@ from r2flow.data.sources import (
     spread,
     warn_of_other_sensor,
 )
-from r2flow.lidar.labels import labels_beside
-from r2flow.lidar.scan_files import points_beside
 from r2flow.store import MANIFEST, Damaged, Store, checksum, read_manifest
 
 log = logging.getLogger(__name__)
@@ -112,11 +110,7 @@ def plan_files(
     reading = replace(reading, on_bad_scan="error", within_limits=True)
     warn_of_other_sensor(paths, reading, root)
     levels = _reflectance_levels(paths, reading)
-    # A range image alone has no labels.
-    labels = all(
-        labels_beside(path) and points_beside(Path(path)).suffix != ".npy" for path in paths
-    )
-    reading = replace(reading, reflectance=levels is not None, labels=labels)
+    reading = replace(reading, reflectance=levels is not None, labels=labelled(paths) > 0)
     names = [name for drive in named for name in drive.scans]
     recipe = {
         "revision": PROJECTION, "layout": layout, "scans": len(names), "names": checksum(names),
@@ -249,8 +243,8 @@ class PreparedScans(ScanSource):
             )
         if labels and "label" not in store.codes:
             raise InputError(
-                f"{store.folder} holds scans without labels. Prepare points that each have a "
-                "file of labels, such as a --split or --drives of the data set."
+                f"{store.folder} holds scans without labels. Prepare points that have files of "
+                "labels beside them."
             )
         places: dict[int, tuple[int, int]] = {}
         for shard, numbers_of_shard in enumerate(store.parts):

@@ -1,6 +1,7 @@
 """Reading of scan files and range images as images of a sensor."""
 
 import json
+import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -11,7 +12,14 @@ import numpy as np
 
 from r2flow.base.errors import InputError, naming, warn_odd
 from r2flow.lidar.estimation import FULL_REFLECTANCE, OUTLIERS, SURE, full_reflectance
-from r2flow.lidar.labels import common_classes, labels_beside, read_labels
+from r2flow.lidar.labels import (
+    SEMANTIC_KITTI,
+    LabelList,
+    common_classes,
+    label_list,
+    labels_beside,
+    read_labels,
+)
 from r2flow.lidar.projection import Convention, Projection, project_indices, scatter
 from r2flow.lidar.scan_files import (
     NoPointsError,
@@ -23,6 +31,8 @@ from r2flow.lidar.scan_files import (
 from r2flow.lidar.sensors import Sensor
 from r2flow.store import manifest_of
 
+log = logging.getLogger(__name__)
+
 AUTO = "auto"
 FAINT = 0.1  # of full reflectance: below it the scale is probably wrong
 DARKEST = 0.01  # likewise of the median; that of bytes is 0.03 or more
@@ -31,9 +41,9 @@ DIVIDED = (
     "names another value"
 )
 DARK = (
-    "reflectance stays below a tenth of full reflectance, or half of it below a hundredth: give "
-    "its value as --reflectance-scale, in training as data.reading.reflectance_scale; "
-    "r2flow sensor estimates it"
+    "reflectance stays below a tenth of full reflectance, or half of it below a hundredth: the "
+    "estimate of full reflectance may be wrong; give its value as --reflectance-scale, in training "
+    "as data.reading.reflectance_scale, in a sensor's file as reflectance_scale"
 )
 
 
@@ -57,10 +67,18 @@ class Reading:
     #: are.
     within_limits: bool = False
     columns: tuple[str, ...] | None = None  #: as in `r2flow.lidar.scan_files.read_points`
+    label_ids: LabelList = SEMANTIC_KITTI  #: of label files, as `label_list` takes it
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "label_ids", label_list(self.label_ids))
 
     def described(self) -> dict[str, Any]:
         """All fields as plain values, for manifests."""
-        values = {**vars(self), "sensor": self.sensor.described()}
+        values = {
+            **vars(self),
+            "sensor": self.sensor.described(),
+            "label_ids": self.label_ids.described,
+        }
         return json.loads(json.dumps(values))  # turns tuples into lists
 
     @classmethod
@@ -118,22 +136,45 @@ def nothing_in_view(path: str | Path, points: Points, sensor: Sensor) -> NoPoint
     )
 
 
-def read_labelled_scan(path: Path, file: Path, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
+def read_labelled_scan(
+    path: Path, file: Path, reading: Reading, ids: LabelList | None = SEMANTIC_KITTI
+) -> tuple[np.ndarray, np.ndarray]:
     """The image of a scan, and from its label file each pixel's semantic id, (H, W) uint16, 0 for
-    no return.
+    no return; `ids` as in `read_labels`.
     """
     image, points, pixels, chosen = read_projected(path, reading)
-    labels = read_labels(file, path, points)[chosen]
+    labels = read_labels(file, path, points, ids)[chosen]
     return image, scatter(reading.sensor, pixels, [labels])[0].astype(np.uint16)
 
 
 def _with_labels(path: Path, reading: Reading) -> np.ndarray:
-    """The image of a scan with the common class of each ray as its last channel."""
+    """The image of a scan with the common class of each ray as its last channel, 0 without a file
+    of labels.
+    """
     file = labels_beside(path)
     if file is None:
-        raise InputError(f"{path} has no labels: there is no {path.stem}.label for it.")
-    image, ids = read_labelled_scan(path, file, reading)
+        return _unlabelled(read_projected(path, reading)[0])
+    image, ids = read_labelled_scan(path, file, reading, reading.label_ids)
     return np.concatenate([image, common_classes(ids)[None]])
+
+
+def _unlabelled(image: np.ndarray) -> np.ndarray:
+    return np.concatenate([image, np.zeros_like(image[:1])])
+
+
+def labelled(paths: Sequence[str | Path]) -> int:
+    """The number of scan files with labels; warns of those without, if some have them."""
+    missing = [path for path in paths if not _has_labels(points_beside(Path(path)))]
+    number = len(paths) - len(missing)
+    if number and missing:
+        log.warning(
+            "%d of %d scans have labels; the first without: %s", number, len(paths), missing[0]
+        )
+    return number
+
+
+def _has_labels(path: Path) -> bool:
+    return bool(labels_beside(path)) and path.suffix.lower() != ".npy"
 
 
 def _no_reflectance(path: str | Path) -> InputError:
@@ -153,6 +194,11 @@ def estimated_scale(path: str | Path, scans: Iterable[Points]) -> float:
     if scale not in SURE:
         warn_odd(Path(path), DIVIDED % scale)
     return scale
+
+
+def is_dark(reflectance: np.ndarray, scale: float) -> bool:
+    """Whether values above 0 are so far below full reflectance that it is probably another one."""
+    return bool(reflectance.max() < FAINT * scale or np.median(reflectance) < DARKEST * scale)
 
 
 def scaled_reflectance(
@@ -178,11 +224,10 @@ def reflectance_and_scale(
     if len(seen):
         fractions = np.mean(seen > 1) <= OUTLIERS and (seen % 1).any()
         if scale in FULL_REFLECTANCE[1:] and fractions:
-            warn_odd(
-                path, f"reflectance is not divided by {scale:g}: its values are fractions of 1"
-            )
+            kind = f"reflectance already lies in 0 to 1, and is not divided by {scale:g}"
+            warn_odd(path, kind)
             scale = 1.0
-        if highest < FAINT * scale or np.median(seen) < DARKEST * scale:
+        if is_dark(seen, scale):
             warn_odd(path, DARK)
     if strict and stored.min(initial=0) < 0:
         raise InputError(
@@ -221,11 +266,9 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
         )
     if len(image) < channels:
         raise _no_reflectance(path)
-    if reading.labels:
-        raise InputError(f"{path} is a range image, which has no labels: give points.")
     image = image[:channels]
     if not reading.within_limits:
-        return image
+        return _unlabelled(image) if reading.labels else image
     r = image[0]
     nearest = reading.sensor.min_range
     farthest = reading.sensor.max_range
@@ -243,7 +286,7 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
             "divide by full reflectance."
         )
     image[1:] = image[1:].clip(0, 1)
-    return image
+    return _unlabelled(image) if reading.labels else image
 
 
 def read_points_image(path: Path, reading: Reading) -> tuple[np.ndarray, np.ndarray]:

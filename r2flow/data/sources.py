@@ -25,7 +25,7 @@ from r2flow.base.errors import InputError, check, warn_odd
 from r2flow.base.files import cache_folder
 from r2flow.base.progress import track
 from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
-from r2flow.lidar.estimation import Doubt, differing, in_words, is_unclear, other_sensor
+from r2flow.lidar.estimation import Doubt, differing, hangs, in_words, is_unclear, other_sensor
 from r2flow.lidar.labels import common_classes, labels_beside
 from r2flow.lidar.scan_files import Points, read_points, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -173,6 +173,12 @@ def warn_of_frame(scans: Mapping[Any, Points]) -> bool:
     path = Path(next(iter(scans)))
     if any(turns(scan) > SEVERAL for scan in points):
         warn_odd(path, "a file holds several turns of the sensor; a scan is one: split it")
+    if hangs(points):
+        warn_odd(
+            path,
+            "the ground lies above the sensor: if it hangs upside down, negate y and z of the "
+            "points; models expect z upwards",
+        )
     if pair := differing(points):
         seen = " and ".join(f"{[*scans][n]} ({in_words(beams)})" for n, beams in pair)
         warn_odd(path, f"read as scans of one sensor, but {seen} are of two: read them apart")
@@ -261,10 +267,11 @@ class ScanFiles(ScanSource):
         """Hash of all names and sizes, with `times` also of the times of change, and of the
         contents of some files.
         """
-        stats = []
+        stats: list[Any] = []
         hashes = []
         paths = [*self.paths]
         if self.reading.labels:
+            stats += self.reading.label_ids.ids
             paths += [found for path in paths if (found := labels_beside(path))]
         for path in paths:
             with suppress(OSError):  # reported when the scan is read

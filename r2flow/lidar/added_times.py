@@ -10,6 +10,8 @@ from r2flow.base.errors import InputError
 
 FEWEST = 8  # points of a row whose times are used
 APART = 10  # degrees between points from which the rate of turning is found
+CYCLE = 4  # rows after which an Ouster's beams look the same way again
+LEAST_STEP = np.radians(0.5)  # by which they look further in each
 MOST_ODD = 0.1  # share of such points whose times may contradict the turning
 
 
@@ -36,7 +38,8 @@ def times_of(
     In a row with measured points, a ray's time is interpolated in azimuth between its neighbours;
     at the turn's start, where they are a turn apart, it continues the nearer one's at the rate of
     turning. In a row without, it is the mean of those in the measured rows above and below, by
-    their distance. No time is outside the sweep.
+    their distance; of an Ouster, at the azimuths at which they fire with it (`_ahead`). No time is
+    outside the sweep.
 
     Args:
         time: Times of the measured points, (N,), of any unit: absolute or relative, integer or not.
@@ -106,10 +109,33 @@ def _in_turn(turning: _Turning, row: ndarray, azimuth: ndarray) -> ndarray:
     above = filled[(after - 1).clip(0)]
     below = filled[after.clip(max=len(filled) - 1)]
     above = np.where(below <= row, below, above)  # a measured row is both
-    upper = _in_row(turning, above, azimuth)
-    lower = np.where(below == above, upper, _in_row(turning, below, azimuth))
+    ahead = _ahead(turning, max(int(row.max(initial=0)) + 1, len(turning.start)))
+    upper = _in_row(turning, above, azimuth + ahead[row] - ahead[above])
+    other = _in_row(turning, below, azimuth + ahead[row] - ahead[below])
+    lower = np.where(below == above, upper, other)
     up, down = abs(row - above), abs(below - row)
     return _between(upper, lower, up, down, 2 * pi * abs(turning.rate))
+
+
+def _ahead(turning: _Turning, rows: int) -> ndarray:
+    """How far each row looks ahead of the sensor's azimuth in radians, (H,), if rows are those of
+    an Ouster: each looks further than the one above, and every `CYCLE`-th as the first. Else 0.
+
+    So rows without measured points, between others, are known too.
+    """
+    filled = np.flatnonzero(np.diff(turning.start) >= FEWEST)
+    place = np.repeat(np.arange(len(turning.start) - 1), np.diff(turning.start))
+    look = np.exp(1j * (turning.time / turning.rate - turning.azimuth))
+    of_row = np.bincount(place, look.real) + 1j * np.bincount(place, look.imag)
+    looks = np.angle(of_row[filled] / of_row[filled].sum())
+    phase = filled % CYCLE
+    if len(set(phase)) < 2:
+        return np.zeros(rows)
+    step, first = np.polyfit(phase, looks, 1)
+    off = abs(looks - first - step * phase)
+    if abs(step) < LEAST_STEP or np.median(off) > abs(step) / 10:
+        return np.zeros(rows)
+    return step * (np.arange(rows) % CYCLE)
 
 
 def _in_row(turning: _Turning, row: ndarray, azimuth: ndarray) -> ndarray:

@@ -1,14 +1,17 @@
-"""Semantic labels of scans: SemanticKITTI's `.label` files and ids, PandaSet's, and the common
-classes of labelled models.
+"""Semantic labels of scans: `.label` files in SemanticKITTI's ids or those of another list,
+PandaSet's, and the common classes of labelled models.
 """
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy import ndarray
 
-from r2flow.base.errors import InputError
-from r2flow.base.files import atomic_write, reading
+from r2flow.base.errors import InputError, check, naming, quoted
+from r2flow.base.files import atomic_write, parse_yaml, reading
 from r2flow.lidar.scan_files import (
     LARGEST_FILE,
     TABLE_ENDINGS,
@@ -16,43 +19,11 @@ from r2flow.lidar.scan_files import (
     pandaset,
 )
 
-# SemanticKITTI's ids: name, and the colour in pictures (ground grey to violet, vehicles blue,
-# people red, plants green, buildings and fences brown; moving objects as static ones).
-CLASSES = {
-    0: ("unlabeled", "#6b727c"),
-    1: ("outlier", "#454b54"),
-    10: ("car", "#3f8efc"),
-    11: ("bicycle", "#7fd1ff"),
-    13: ("bus", "#2a5bd7"),
-    15: ("motorcycle", "#58b4e8"),
-    16: ("on-rails", "#1b3a9e"),
-    18: ("truck", "#5c7cfa"),
-    20: ("other vehicle", "#8aa2ff"),
-    30: ("person", "#ff4d4d"),
-    31: ("bicyclist", "#ff8787"),
-    32: ("motorcyclist", "#d6336c"),
-    40: ("road", "#9a86c9"),
-    44: ("parking", "#c3a6e8"),
-    48: ("sidewalk", "#d9b8d9"),
-    49: ("other ground", "#a07f8f"),
-    50: ("building", "#d9a441"),
-    51: ("fence", "#b5713c"),
-    52: ("other structure", "#8f6a3a"),
-    60: ("lane marking", "#f4ecff"),
-    70: ("vegetation", "#37a046"),
-    71: ("trunk", "#7a5a2f"),
-    72: ("terrain", "#a8cf6a"),
-    80: ("pole", "#ffe066"),
-    81: ("traffic sign", "#ff922b"),
-    99: ("other object", "#5fd3bc"),
-    252: ("moving car", "#3f8efc"),
-    253: ("moving bicyclist", "#ff8787"),
-    254: ("moving person", "#ff4d4d"),
-    255: ("moving motorcyclist", "#d6336c"),
-    256: ("moving on-rails", "#1b3a9e"),
-    257: ("moving bus", "#2a5bd7"),
-    258: ("moving truck", "#5c7cfa"),
-    259: ("moving other vehicle", "#8aa2ff"),
+_LISTS = Path(__file__).with_name("label_lists")
+# SemanticKITTI's ids: name, and the colour in pictures.
+CLASSES: dict[int, tuple[str, str]] = {
+    number: tuple(named)
+    for number, named in parse_yaml((_LISTS / "semantic_kitti.yaml").read_text("utf-8")).items()
 }
 
 # Ids by SemanticKITTI's spelling of the names.
@@ -86,6 +57,102 @@ def semantic_ids(classes: ndarray) -> ndarray:
     return _IDS[classes.astype(np.uint8)]
 
 
+@dataclass(frozen=True)
+class LabelList:
+    """The ids of a data set or a network, and the SemanticKITTI id that each is read as."""
+
+    name: str
+    ids: tuple[tuple[int, int], ...]
+
+    @property
+    def described(self) -> Any:
+        """As plain values that `label_list` takes."""
+        return self.name if self.name in _names() else dict(self.ids)
+
+    def semantic(self, found: ndarray) -> ndarray:
+        """SemanticKITTI's ids of ids of this list, uint16, of the same shape.
+
+        Raises:
+            InputError: Some are not in the list, so they are of another one.
+        """
+        seen, place, counts = np.unique(found, return_inverse=True, return_counts=True)
+        known = dict(self.ids)
+        shares = {int(i): n / found.size for i, n in zip(seen, counts, strict=True)}
+        strange = sorted(shares.keys() - known.keys())
+        if strange:
+            frequent = sorted(shares, key=lambda number: -shares[number])[:8]
+            told = ", ".join(f"{number} ({shares[number]:.1%})" for number in frequent)
+            fitting = [n for n in _names() if shares.keys() <= dict(label_list(n).ids).keys()]
+            named = " or ".join([*fitting, "a YAML file of lines such as `1: car`"])
+            raise InputError(
+                f"its labels are not of {self.name}, which has no {str(strange[:8])[1:-1]}; most "
+                f"frequent: {told}. Name their list by --label-ids, in training "
+                f"data.reading.label_ids: {named}."
+            )
+        read_as = np.array([known[number] for number in shares], np.uint16)
+        return read_as[place].reshape(found.shape)
+
+    def of_classes(self, classes: ndarray) -> ndarray:
+        """The id of this list that stands for each common class, uint32: that of `semantic_ids`,
+        else the first id of the class, else one without a class.
+        """
+        numbers: list[int] = []
+        for number, usual in enumerate(_IDS):
+            of_class = [own for own, id in self.ids if _COMMON[id] == number]
+            same = [own for own, id in self.ids if id == usual]
+            numbers.append(next(iter([*same, *of_class, *numbers[:1], 0])))
+        return np.array(numbers, np.uint32)[classes.astype(np.uint8)]
+
+
+def _names() -> list[str]:
+    return sorted(path.stem for path in _LISTS.glob("*.yaml"))
+
+
+def label_list(given: "str | Mapping[Any, Any] | LabelList") -> LabelList:
+    """A list of ids: a name in `label_lists`, a YAML file, or the map of ids itself, to
+    SemanticKITTI's names or ids. In a file the map may be that of the key `labels`.
+
+    Raises:
+        InputError: There is no such list, or it maps to no class of SemanticKITTI.
+    """
+    if isinstance(given, LabelList):
+        return given
+    entries = given
+    name = "the list given"
+    if isinstance(given, str):
+        name = given
+        file = Path(given).expanduser()
+        if file.suffix.lower() not in (".yaml", ".yml"):
+            known = ", ".join(_names())
+            check(given in _names(), f"no list of ids named {quoted(given)}; known: {known}.")
+            file = _LISTS / f"{given}.yaml"
+        with reading(file, 1 << 20, "list of ids"):
+            entries = parse_yaml(file.read_text(encoding="utf-8"))
+    with naming(name):
+        lines = entries.get("labels", entries) if isinstance(entries, Mapping) else None
+        if not lines or not isinstance(lines, Mapping):
+            raise InputError("it is not a list of ids: give lines such as `1: car`.")
+        ids = [(_whole(number), _semantic_id(named)) for number, named in lines.items()]
+    return LabelList(name, tuple(ids))
+
+
+def _whole(number: Any) -> int:
+    check(str(number).isdecimal(), f"an id is a whole number; found {quoted(number)}.")
+    return int(number)
+
+
+def _semantic_id(named: Any) -> int:
+    """SemanticKITTI's id of a name of its list, or of that id itself."""
+    name = named[0] if isinstance(named, list) else named
+    number: Any = LABELS.get(str(name).replace(" ", "-"), name)
+    known = ", ".join(LABELS)
+    check(number in CLASSES, f"{quoted(name)} is no class of SemanticKITTI; known: {known}.")
+    return int(number)
+
+
+SEMANTIC_KITTI = label_list("semantic_kitti")
+
+
 def labels_beside(scan: str | Path) -> Path | None:
     """The label file of a scan, or None.
 
@@ -104,34 +171,43 @@ def labels_beside(scan: str | Path) -> Path | None:
     return next((path for path in files if path.exists() or path.is_symlink()), None)
 
 
-def write_labels(folder: Path, name: str, classes: ndarray, probability: ndarray) -> None:
-    """Write `NAME.label` of points' common classes, as SemanticKITTI's ids, and their probabilities
-    as `NAME.probability.npz`.
+def write_labels(
+    folder: Path,
+    name: str,
+    classes: ndarray,
+    probability: ndarray,
+    *,
+    ids: LabelList = SEMANTIC_KITTI,
+) -> None:
+    """Write `NAME.label` of points' common classes, as ids of a list, and their probabilities as
+    `NAME.probability.npz`.
     """
     with atomic_write(folder / f"{name}.probability.npz") as file:
         np.savez_compressed(file, probability=probability.astype(np.float16))
     with atomic_write(folder / f"{name}.label") as file:
-        file.write(semantic_ids(classes).astype("<u4").tobytes())
+        file.write(ids.of_classes(classes).astype("<u4").tobytes())
 
 
-def read_labels(path: Path, scan: str | Path, points: Points) -> ndarray:
-    """The semantic id of each of a scan's points, (N,) uint16, without dropped rows.
+def read_labels(
+    path: Path, scan: str | Path, points: Points, ids: LabelList | None = SEMANTIC_KITTI
+) -> ndarray:
+    """The SemanticKITTI id of each of a scan's points, (N,) uint16, without dropped rows.
 
     A `.label` file has a uint32 per row of the scan's file, class id in the low 16 bits, instance
-    in the high. PandaSet's classes become SemanticKITTI's ids.
+    in the high. `ids` is the list of these ids; None: they are returned as they are.
 
     Raises:
-        InputError: The file has not one label a row.
+        InputError: The file has not one label a row, or ids of another list.
     """
     size = 4 * (len(points.xyz) + points.dropped)
     with reading(path, LARGEST_FILE, "file of labels", least=0):
         if path.name.endswith(TABLE_ENDINGS):
-            ids = pandaset.read_classes(path, Path(scan))
-            return ids if points.kept is None else ids[points.kept]
-        found = path.stat().st_size  # checked first: a file of the wrong size is not loaded
-        if found != size:
-            raise InputError(
-                f"it holds {found} bytes, not {size}: a uint32 for each point of {scan}."
-            )
-        ids = np.fromfile(path, dtype="<u4").astype(np.uint16)  # the low 16 bits
-    return ids if points.kept is None else ids[points.kept]
+            found = label_list("pandaset").semantic(pandaset.read_classes(path, Path(scan)))
+            return found if points.kept is None else found[points.kept]
+        bytes = path.stat().st_size  # checked first: a file of the wrong size is not loaded
+        check(
+            bytes == size, f"it holds {bytes} bytes, not {size}: a uint32 for each point of {scan}."
+        )
+        found = np.fromfile(path, dtype="<u4").astype(np.uint16)  # the low 16 bits
+        found = found if ids is None else ids.semantic(found)
+    return found if points.kept is None else found[points.kept]

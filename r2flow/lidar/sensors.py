@@ -14,8 +14,8 @@ import yaml
 from numpy import ndarray
 from torch import Tensor
 
-from r2flow.base.errors import InputError
-from r2flow.base.files import reading, write_file
+from r2flow.base.errors import InputError, quoted
+from r2flow.base.files import parse_yaml, reading, write_file
 from r2flow.base.registry import Registry, check_options, construct, options_of
 
 Rays = Literal["centre", "reference"]
@@ -62,7 +62,7 @@ class Sensor:
         }
         for rule, holds in rules.items():
             if not holds:
-                raise InputError(f"sensor {self.name!r}: {rule}.")
+                raise InputError(f"sensor {quoted(self.name)}: {rule}.")
 
     def described(self) -> dict[str, Any]:
         """All fields that images depend on, as plain values: all except `reflectance_scale`."""
@@ -131,7 +131,9 @@ class Sensor:
             return sensor
         most = MOST_PIXELS // sensor.columns
         if not 2 <= rows <= most:
-            raise InputError(f"sensor {self.name!r}: rows must be 2 to {most:,}, found {rows}.")
+            raise InputError(
+                f"sensor {quoted(self.name)}: rows must be 2 to {most:,}, found {rows}."
+            )
         if rows > old and rays == "centre":
             beam = np.arange(-1, old + 1)  # with a step beyond the first and the last beam
             above = min(2 * e[0] - e[1], e[0] / 2 + 45)
@@ -237,7 +239,7 @@ def build_sensor(
 def read_sensor(path: str | Path) -> Sensor:
     """Read a sensor from a YAML file with the options of `build_sensor`."""
     with reading(Path(path), 1 << 20, "sensor's YAML"):  # of a dozen lines
-        options = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        options = parse_yaml(Path(path).read_text(encoding="utf-8"))
         if not isinstance(options, dict):
             raise InputError("it is not a sensor: give `name: mine`, `elevations: [15.0, ...]`.")
         if options.get("rays", "centre") != "centre":
@@ -252,13 +254,18 @@ def named_sensor(sensor: Sensor | str, size: tuple[int, int] | None = None) -> S
     return sensor if size is None else sensor.resized(*size)
 
 
-def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
-    """Write a sensor as a YAML file that begins with a comment, such as the numbers' source."""
+def sensor_yaml(sensor: Sensor, comment: str) -> str:
+    """A sensor as YAML that begins with a comment, such as the numbers' source."""
     units = "Elevations in degrees, the top row first; ranges and height in metres."
     lines = [f"# {line}\n" for line in (*comment.splitlines(), units)]
     options = options_of_sensor(sensor)
     text = yaml.safe_dump(options, default_flow_style=None, sort_keys=False, width=100)
-    write_file(path, "".join(lines) + text)
+    return "".join(lines) + text
+
+
+def write_sensor(sensor: Sensor, path: str | Path, comment: str) -> None:
+    """Write a sensor as a YAML file (`sensor_yaml`)."""
+    write_file(path, sensor_yaml(sensor, comment))
 
 
 def options_of_sensor(sensor: Sensor) -> dict[str, Any]:

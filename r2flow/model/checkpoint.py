@@ -154,6 +154,7 @@ class Checkpoint:
         sensor: Sensor | str | None = None,
         columns: Sequence[str] | None = None,
         keep_beams: bool = False,
+        label_ids: str | None = None,
         **how: Any,
     ) -> "tuple[Checkpoint, list[PartialScan], list[str]]":
         """This model for the sensor of scans to complete, the scans, and remarks; see
@@ -163,12 +164,16 @@ class Checkpoint:
         that sees past its own.
         """
         named = None if sensor is None else named_sensor(sensor)
-        reading = reading_for([], self, columns=columns, labels=self.encoding.labels)
+        reading = reading_for(
+            [], self, columns=columns, labels=self.encoding.labels, label_ids=label_ids
+        )
         scans, remarks = open_partial(specs, reading, named, **how)
         transfers = isinstance(self.generator, TransferFlow)
         views = {scan.whole for scan in scans}
         if keep_beams and transfers and len(views) == 1 and (view := views.pop()):
-            model, scans, remarks = self.through(view).open_partial(specs, sensor, columns, **how)
+            model, scans, remarks = self.through(view).open_partial(
+                specs, sensor, columns, label_ids=label_ids, **how
+            )
             size = "x".join(map(str, view.shape))
             remarks.append(f"completed in their own view, as {size}, which keeps all their beams")
             return model, scans, remarks

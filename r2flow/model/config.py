@@ -154,6 +154,7 @@ class RunConfig:
     few: Free[Options | None] = None
     chain: Annotated[Mapping[Any, Any] | None, _OwnOfALink] = None  # links by name
     preview: Annotated[str | None, _OwnOfALink] = None
+    metric: Annotated[str, _OwnOfALink] = "val/loss"  # of a sweep's job, for its sweeper
     loggers: Free[Sequence[str] | None] = None
     plugins: Free[Sequence[str]] = ()
     scans: Found[Any] = None  # identity of the scans

@@ -8,6 +8,7 @@ from numpy import ndarray
 from r2flow.data.partial import PartialScan
 from r2flow.lidar.added import unknown_fields
 from r2flow.lidar.known import Ray
+from r2flow.lidar.labels import COMMON
 from r2flow.lidar.other_sensors import Partial
 from r2flow.lidar.scan_files import WRITTEN
 from r2flow.lidar.sensors import Sensor
@@ -21,6 +22,7 @@ class Counts:
     rays: ndarray = field(default_factory=lambda: np.zeros(len(Ray), int))  # of each state
     outside: int = 0  # points
     added: int = 0
+    classes: ndarray = field(default_factory=lambda: np.zeros(len(COMMON) + 1, int))  # returns
     unknown: dict[str, None] = field(default_factory=dict)  # fields that added points lack
     beside: bool = False  # whether fields lie in files beside those of the points
 
@@ -32,6 +34,9 @@ class Counts:
             )
         returned = completed.images[:, 0].numpy() > 0
         self.added += int((returned & (given.state != Ray.RETURN)).sum())
+        if completed.images.shape[1] > 2:
+            classes = completed.images[:, 2].numpy()[returned].astype(int)
+            self.classes += np.bincount(classes, minlength=len(self.classes))
         if not scan.image:
             self.rays += np.bincount(given.state.ravel(), minlength=len(Ray))
         if given.points and given.points.cloud:
@@ -49,6 +54,10 @@ def print_counts(sensor: Sensor, counts: Counts) -> None:
         print(
             f"{share:.0%} of the measured rays have no return: for thinned scans give --fill-gaps"
         )
+    if of_class := counts.classes[1:].sum():
+        shares = zip(COMMON, counts.classes[1:] / of_class, strict=True)
+        ordered = sorted(shares, key=lambda named: -named[1])
+        print(f"classes: {', '.join(f'{name} {part:.0%}' for name, part in ordered if part)}")
     if counts.unknown:
         print(f"NaN or 0 for added points: {', '.join(counts.unknown)[:200]}")
     if counts.beside:

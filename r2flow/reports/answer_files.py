@@ -76,7 +76,7 @@ def write_answers(
         name = path.name.removesuffix(scan_ending(path.name) or path.suffix)
         if scan.image:
             if labelled:
-                write_labelled(image, sensor.rays(), path.parent, name, ["ply"])
+                write_labelled(image, sensor.rays(), path.parent, name, ["ply"], job.label_ids)
             save_array(path, image[: 1 if silent else 2])
             continue
         with naming(scan.path or scan.name):
@@ -85,7 +85,7 @@ def write_answers(
         if labelled or drawn:
             values = _of_points(given, image, sensor.rays())
             if labelled:
-                write_labels(path.parent, name, *values[1:])
+                write_labels(path.parent, name, *values[1:], ids=job.label_ids)
             if drawn:
                 cloud = cloud.with_reflectance(values[0] * given.scale)
         write_cloud(path, cloud)

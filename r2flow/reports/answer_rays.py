@@ -12,6 +12,7 @@ from r2flow.base.progress import track
 from r2flow.data.partial import PartialScan
 from r2flow.generators.base import Precision
 from r2flow.lidar.known import Mask, Ray, share_in_sectors
+from r2flow.lidar.labels import SEMANTIC_KITTI, LabelList
 from r2flow.lidar.other_sensors import Partial, gaps_unknown
 from r2flow.lidar.scan_files import Points
 from r2flow.model.shipped import DEFAULT, DENSIFY
@@ -29,6 +30,7 @@ class Job:
     batch_size: int = 1
     pictures: int = 8  # number of scans with a picture and a 3-D page
     precision: Precision = "32-true"
+    label_ids: LabelList = SEMANTIC_KITTI  # of the labels of scans and answers
 
 
 def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:

@@ -54,7 +54,7 @@ def write_completed(
         "precision": job.precision,
         "hide": sorted(job.hide) or None,
     }
-    recipe = recipe_of(checkpoint, job.seed, sampler, completion=settings)
+    recipe = recipe_of(checkpoint, job.seed, sampler, job.label_ids, completion=settings)
     store = Store(out, "answers", recipe)
     files = {scan.name: answer_files(scan, out, job.num) for scan in scans}
     inputs = check_inputs(store, scans, files)
@@ -93,7 +93,7 @@ def write_completed(
         done: Iterable[tuple[Partial, Completed]] = ()
         if left:
             first = answer(left[0])  # it shows that the settings are valid
-            store.check()  # commands for other scans add theirs at the same time
+            store.begin()  # commands for other scans add theirs at the same time
             before = manifest_of(out)
             scales = {scan.name: scan.scale for scan in scans}
             store.write_manifest(

@@ -54,12 +54,18 @@ def group_runs(runs: Sequence[ComparedRun]) -> Groups:
         # Folders of a sweep are named after the swept values and a hash.
         name = group[0].label
         if len(group) > 1:
-            name = (
-                re.sub(r"[-_.,/= ]*seed[-_.= ]*\d+[-_.,/= ]*|-\w{6}$", "", name)
-                or group[0].values["stage"]
-            )
+            seeds = r"[-_.,/= ]*seed[-_.= ]*\d+[-_.,/= ]*|-\w{6}$"
+            alike = _shared([re.sub(seeds, "", run.label) for run in group])
+            name = alike.rstrip("-_.,/= ") or group[0].values["stage"]
         named[f"{name} ({len(named)})" if name in named else name] = group
     return named
+
+
+def _shared(names: Sequence[str]) -> str:
+    """The longest beginning of some names."""
+    first, last = min(names), max(names)
+    differ = (n for n, (a, b) in enumerate(zip(first, last, strict=False)) if a != b)
+    return first[: next(differ, len(first))]
 
 
 def configuration(config: Row) -> str:
@@ -87,7 +93,11 @@ def _group_rows(groups: Groups) -> list[Row]:
     """One row per group: means of the runs with a value, and the deviation of several."""
     rows = []
     for label, runs in groups.items():
-        row = {"name": label, "n": len(runs)}
+        started = sum(run.values["steps"] is not None for run in runs)
+        row = {
+            "name": label,
+            "n": len(runs) if started == len(runs) else f"{started} of {len(runs)}",
+        }
         for column in _SETTINGS:
             equal = {run.values[column] for run in runs}
             row[column] = equal.pop() if len(equal) == 1 else None

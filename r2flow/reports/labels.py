@@ -1,5 +1,6 @@
 """Labels of scans against true ones: `r2flow evaluate --metrics miou`."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,15 @@ from scipy.stats import t as student
 from r2flow.base.errors import InputError
 from r2flow.base.progress import track
 from r2flow.data.opening import describe
-from r2flow.lidar.labels import COMMON, common_classes, labels_beside, read_labels
+from r2flow.lidar.labels import (
+    COMMON,
+    SEMANTIC_KITTI,
+    LabelList,
+    common_classes,
+    label_list,
+    labels_beside,
+    read_labels,
+)
 from r2flow.lidar.scan_files import points_beside, read_points, scan_ending
 from r2flow.metrics.labels import class_ious, confusion, mean_iou
 from r2flow.reports.tables import Row
@@ -19,14 +28,16 @@ SAME = 0.01  # metres between a true point and the labelled one
 BINS = 10  # of probability
 
 
-def label_rows(real: str, generated: str) -> tuple[list[Row], list[Row]]:
+def label_rows(real: str, generated: str, ids: Sequence[str] = ()) -> tuple[list[Row], list[Row]]:
     """Rows of IoU, a row a class, and of calibration, a row a tenth of probability.
 
-    Scans of the same name are compared at the points that both have.
+    Scans of the same name are compared at the points that both have. `ids` are lists of label ids:
+    one of both, or those of the real and of the generated scans; r2flow's answers know theirs.
 
     Raises:
         InputError: no scan of the same name with labels.
     """
+    lists = [_ids_of(real, ids[:1]), _ids_of(generated, ids[-1:])]
     truth = _labelled(real)
     found = _labelled(generated)
     pairs = [*zip(truth.values(), found.values(), strict=False)]
@@ -41,7 +52,7 @@ def label_rows(real: str, generated: str) -> tuple[list[Row], list[Row]]:
     sure = np.zeros((3, BINS))  # points, the sum of their probabilities, and the right ones
     means = []
     for one, other in track(pairs, "comparing", "scans"):
-        true, labels, probability = _matched(one, other)
+        true, labels, probability = _matched(one, other, lists)
         counts = confusion(true, labels)
         if not counts.any():
             raise InputError(f"{one} and {other} share no point with a label.")
@@ -70,6 +81,12 @@ def label_rows(real: str, generated: str) -> tuple[list[Row], list[Row]]:
     return rows, calibration
 
 
+def _ids_of(spec: str, given: Sequence[str]) -> LabelList:
+    """The list of the label ids of a name's scans."""
+    stored = describe(spec).stored
+    return stored.label_ids if stored else label_list(next(iter(given), SEMANTIC_KITTI))
+
+
 def _labelled(spec: str) -> dict[str, Path]:
     """The scans of a name that have labels, by their path without ending."""
     scans = describe(spec)
@@ -81,21 +98,23 @@ def _labelled(spec: str) -> dict[str, Path]:
     return files
 
 
-def _matched(truth: Path, found: Path) -> tuple[ndarray, ndarray, ndarray | None]:
+def _matched(
+    truth: Path, found: Path, lists: Sequence[LabelList]
+) -> tuple[ndarray, ndarray, ndarray | None]:
     """True and found classes, and the found ones' probabilities, of the points of both."""
-    xyz, true, _ = _points(truth)
-    others, labels, probability = _points(found)
+    xyz, true, _ = _points(truth, lists[0])
+    others, labels, probability = _points(found, lists[1])
     distance, number = cKDTree(others).query(xyz, distance_upper_bound=SAME)
     both = np.isfinite(distance)
     number = number[both]
     return true[both], labels[number], None if probability is None else probability[number]
 
 
-def _points(path: Path) -> tuple[ndarray, ndarray, ndarray | None]:
+def _points(path: Path, ids: LabelList) -> tuple[ndarray, ndarray, ndarray | None]:
     file = labels_beside(path)
     assert file is not None
     points = read_points(path)
-    classes = common_classes(read_labels(file, path, points))
+    classes = common_classes(read_labels(file, path, points, ids))
     saved = file.with_suffix(".probability.npz")
     if not saved.is_file():
         return points.xyz, classes, None

@@ -17,7 +17,7 @@ from r2flow.base.progress import Bar, track
 from r2flow.data.opening import reading_for
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
-from r2flow.lidar.labels import write_labels
+from r2flow.lidar.labels import SEMANTIC_KITTI, LabelList, label_list, write_labels
 from r2flow.lidar.projection import image_points, write_scan
 from r2flow.lidar.region import Region
 from r2flow.model.checkpoint import Checkpoint
@@ -46,6 +46,7 @@ def write_samples(
     replace: bool = False,
     precision: Precision = "32-true",
     labels: Checkpoint | None = None,
+    label_ids: str | None = None,
 ) -> Sequence[str]:
     """Sample scans and write each as `out/NNNNNN.FORMAT`, the first ones also as pictures and in
     3-D.
@@ -54,7 +55,7 @@ def write_samples(
     deletes samples of other settings in the folder. Files have the sensor's shape, 0 outside the
     region. Formats: `ply` and `bin` are points in metres with reflectance, `npy` is the range
     image, float32 (2 or 1, H, W); default: all that suit the model. `labels`, a labelled model of
-    the same images, adds labels of the points. Returns the formats.
+    the same images, adds labels of the points, ids of the list `label_ids`. Returns the formats.
     """
     generator = checkpoint.generator
     sampler = sampler or generator.sampler
@@ -70,6 +71,7 @@ def write_samples(
         checkpoint,
         seed,
         sampler,
+        label_ids,
         region=region and asdict(region),
         precision=None if precision == "32-true" else precision,
         labels=labels and weights_hash(labels),
@@ -77,6 +79,7 @@ def write_samples(
     store = FileStore(out, "samples", recipe, endings)
     stale = _stale_files(store, replace)
     rays = checkpoint.sensor.rays()
+    ids = label_list(label_ids or SEMANTIC_KITTI)
     shown: list[ndarray] = []
     batches = [range(first, min(first + batch_size, num)) for first in range(0, num, batch_size)]
     left = [part for part in batches if part.start < pictures or stale or store.missing(part)]
@@ -94,7 +97,7 @@ def write_samples(
                 store.begin()
             images = drawn.images if labels is None else label(labels, drawn.images)
             for number, image in zip(numbers, images.numpy(), strict=True):
-                write_labelled(image, rays, store.folder, f"{number:06d}", endings)
+                write_labelled(image, rays, store.folder, f"{number:06d}", endings, ids)
                 if number < pictures:
                     shown.append(image)
             done += len(numbers)
@@ -112,11 +115,13 @@ def write_samples(
 
 
 def write_labelled(
-    image: ndarray, rays: Tensor, out: Path, name: str, endings: Sequence[str]
+    image: ndarray, rays: Tensor, out: Path, name: str, endings: Sequence[str], ids: LabelList
 ) -> None:
-    """Write an image by `write_scan`, and the labels of its points, if it has any."""
+    """Write an image by `write_scan`, and the labels of its points, if it has any, as ids of a
+    list.
+    """
     if len(image) > 2:
-        write_labels(out, name, *image_points(image, rays)[1][1:])
+        write_labels(out, name, *image_points(image, rays)[1][1:], ids=ids)
     write_scan(image[:2], rays, out, name, endings)
 
 
@@ -134,12 +139,18 @@ def _stale_files(store: FileStore, replace: bool) -> list[Path]:
     return []
 
 
-def recipe_of(checkpoint: Checkpoint, seed: int, sampler: Sampler, **more: Any) -> dict[str, Any]:
+def recipe_of(
+    checkpoint: Checkpoint,
+    seed: int,
+    sampler: Sampler,
+    label_ids: str | LabelList | None = None,
+    **more: Any,
+) -> dict[str, Any]:
     """Recipe of the store of samples: settings that affect samples if not None, and how to read
     them.
     """
     return {
-        "reading": reading_for([], checkpoint).described(),
+        "reading": reading_for([], checkpoint, label_ids=label_ids).described(),
         "encoding": {
             **checkpoint.config.get("encoding", {}),
             "reflectance": checkpoint.encoding.reflectance,

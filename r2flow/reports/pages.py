@@ -164,13 +164,13 @@ def _markdown(page: Page, origin: Mapping[str, Any]) -> str:
         for key, value in origin.items()
         if key not in ("report", "command")
     ]
-    again = [
-        "## Where this comes from",
-        "Made with",
-        f"```\n{origin['command']}\n```",
-        "\n".join(notes),
-    ]
-    return "\n\n".join([f"# {page.title}", *pictures, *page.text, *again]) + "\n"
+    runs = re.findall("`+", origin["command"])
+    fence = "`" * max(3, *(1 + len(run) for run in runs), 3)  # no name ends it
+    texts = [f"# {page.title}", *pictures, *page.text, "## Where this comes from", "Made with"]
+    code = f"{fence}\n{origin['command']}\n{fence}"
+    # names are no HTML
+    before, after = (text.replace("<", "&lt;") for text in ("\n\n".join(texts), "\n".join(notes)))
+    return f"{before}\n\n{code}\n\n{after}\n"
 
 
 def _cpu_name() -> str:

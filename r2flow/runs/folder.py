@@ -13,7 +13,7 @@ from filelock import FileLock, Timeout
 
 from r2flow.base.config import at_most_three, check_tree, differences
 from r2flow.base.errors import InputError, check
-from r2flow.base.files import write_file
+from r2flow.base.files import parse_yaml, write_file
 from r2flow.base.registry import Config, Options
 from r2flow.model.config import contradictions, is_found
 from r2flow.model.parts import HYPER, NOTES
@@ -62,9 +62,7 @@ def read_config(run: str | Path) -> Config | None:
         text = path.read_text(encoding="utf-8")
         if text.startswith("---") and text.split()[-1] != "...":
             raise ValueError("it is cut")
-        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
-            raise ValueError("it has aliases, which can stand for any size")
-        config = yaml.safe_load(text)
+        config = parse_yaml(text)
         check_tree(config)
     except (yaml.YAMLError, ValueError, RecursionError, AttributeError) as error:
         raise InputError(

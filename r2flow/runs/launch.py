@@ -62,7 +62,11 @@ def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str
     try:
         with handling_signals(signal.SIG_IGN, ignored):
             parsed = _parsed(_with_plugins(arguments, plugins) or ["experiment=demo"])
-            _run_hydra(parsed, command, codes, errors)
+            try:
+                _run_hydra(parsed, command, codes, errors)
+            except ValueError as error:  # of a sweeper, as of jobs without a value
+                if not errors:
+                    raise InputError(in_one_line(error)) from None
             if errors:  # jobs have printed theirs, and come last
                 raise min(errors, key=lambda error: isinstance(error, _JobEnded))
             return max(codes, default=0)
@@ -134,7 +138,7 @@ def _run_hydra(
     launcher = os.getpid()
     original = sys.argv
 
-    def job(config: DictConfig) -> None:
+    def job(config: DictConfig) -> float | None:
         sys.argv = original  # Lightning starts the processes of other devices by it
         try:
             given = list(HydraConfig.get().overrides.task)
@@ -146,7 +150,7 @@ def _run_hydra(
                     f"plug-ins are named on the command line, never in a file: give {named}."
                 )
             if HydraConfig.get().mode == RunMode.MULTIRUN:
-                return _sweep_job(command, given)
+                return _sweep_job(command, given, config["metric"])
             settings = plain(config)
             # imported here, so that Hydra's errors are reported before torch is loaded
             from r2flow.training import RunConfig, build, fit
@@ -160,6 +164,7 @@ def _run_hydra(
             if os.getpid() != launcher:  # a remote launcher sees only exceptions, after all jobs
                 raise
             errors.append(error)
+        return None
 
     def composed() -> None:
         sys.argv = [original[0], *parsed.flags, *parsed.overrides]
@@ -182,9 +187,9 @@ def job_folder(given: Sequence[str], overrides: str) -> str:
     return f"{readable}-{hashlib.sha256(os.fsencode(overrides)).hexdigest()[:6]}"
 
 
-def _sweep_job(command: Sequence[str], given: Sequence[str]) -> None:
+def _sweep_job(command: Sequence[str], given: Sequence[str], metric: str) -> float | None:
     """Run a job of a sweep in its own process, so that its failure or DDP relaunch does not affect
-    other jobs.
+    other jobs; the last value of a metric, for the sweeper, None if the run did not log it.
     """
     run_dir = HydraConfig.get().runtime.output_dir
     code = run_process([*command, *given, override("run_dir", str(run_dir))])
@@ -192,6 +197,10 @@ def _sweep_job(command: Sequence[str], given: Sequence[str]) -> None:
         raise Stopped(code, "the sweep stopped; the same command resumes there")
     if code:
         raise _JobEnded(code, str(run_dir))
+    from r2flow.reports.training import read_curves
+
+    _, values = read_curves(run_dir, [metric]).get(metric, (None, [None]))
+    return values[-1] if values[-1] is None else float(values[-1])
 
 
 def _chain(run: "RunConfig", chain: Options, given: Sequence[str], folders: Sequence[str]) -> int:

@@ -1,5 +1,6 @@
 """Base classes of stages: LightningModules that train a generator."""
 
+import logging
 import math
 from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
@@ -29,13 +30,17 @@ from r2flow.lidar.sensors import Sensor
 from r2flow.metrics import METRICS
 from r2flow.model.checkpoint import check_weights
 from r2flow.model.lineage import Parent, find_parent, model_options, plain
-from r2flow.model.parts import COMPILED, MODEL, NOTES
+from r2flow.model.parts import COMPILED, HYPER, MODEL, NOTES
 from r2flow.model.paths import step_of
 from r2flow.model.sampling import draw, sample
 from r2flow.samplers import build_sampler
 from r2flow.stages.muon import Muon
 
 _BEYOND = 1.1  # largest value of a scan in model space, with some tolerance
+
+_FEW = 32  # held-out scans: a test of fewer is called chance
+
+log = logging.getLogger(__name__)
 
 Batch = dict[str, Tensor]
 BackboneLike = str | nn.Module | Options | None
@@ -160,8 +165,9 @@ class Stage(L.LightningModule, NamedArguments):
             self.generator.few.check(self.generator)
         self.generator.sampler = own
         record = source.record() if source else parent
-        complete = {**self.hparams, **options, "parent": record, "sampler": own.asdict()}
-        self.save_hyperparameters(plain(complete))
+        # kept, since a subclass may save its own arguments over them
+        self._built_with = plain({**options, "parent": record, "sampler": own.asdict()})
+        self.save_hyperparameters({**plain(dict(self.hparams)), **self._built_with})
         self.gradient_clip_val: float | None = None
 
     def prepare_generator(self) -> None:
@@ -269,6 +275,14 @@ class Stage(L.LightningModule, NamedArguments):
         data = getattr(self.trainer, "datamodule", None)
         if stage == "fit" and isinstance(data, ScanDataModule):
             self.check_data(data)
+        callbacks: list[L.Callback] = self.trainer.callbacks  # type: ignore[attr-defined]
+        for callback in callbacks if stage == "fit" else ():
+            monitor = getattr(callback, "monitor", None)
+            if monitor in ("val_loss", "train_loss"):
+                raise InputError(
+                    f"{type(callback).__name__} monitors '{monitor}', which no stage logs. Did you "
+                    f"mean '{monitor.replace('_', '/')}'?"
+                )
 
     def on_fit_start(self) -> None:
         data = getattr(self.trainer, "datamodule", None)
@@ -343,6 +357,9 @@ class Stage(L.LightningModule, NamedArguments):
     def on_test_epoch_end(self) -> None:
         """Log the panel's distances of held-out to generated scans, `test/panel` their mean."""
         found = {f"test/{name}": value for name, value in self.panel.compute().items()}
+        real = int(self.panel.counts[0, 0])
+        if self.trainer.is_global_zero and real < _FEW:
+            log.warning("%d held-out scans are too few: distances to so few are chance", real)
         self.log_dict(found, sync_dist=True)
 
     def configure_optimizers(self) -> Any:
@@ -415,6 +432,7 @@ class Stage(L.LightningModule, NamedArguments):
     def on_save_checkpoint(self, checkpoint: Config) -> None:
         from r2flow.stages import STAGES  # the registry of the classes of this module
 
+        checkpoint.setdefault(HYPER, {}).update(self._built_with)
         checkpoint[NOTES] = {
             "stage": STAGES.name_of(type(self)),
             "plugins": loaded_plugins(),

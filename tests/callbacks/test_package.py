@@ -17,6 +17,12 @@ def test_a_second_copy_is_refused(monkeypatch):
     assert "callbacks" not in sys.modules
 
 
+@pytest.mark.parametrize("name", ["r2flow", "tests", "train", "docs"])
+def test_the_rest_of_a_checkout_is_not_in_the_package(name):
+    with pytest.raises(ModuleNotFoundError):
+        importlib.import_module(f"r2flow.{name}")
+
+
 def test_a_plug_in_comes_before_what_saves_its_state(monkeypatch):
     config = compose(["data=simulated", "backbone=hdit_tiny"])
     monkeypatch.setitem(CALLBACKS._entries, "theirs", L.Callback)

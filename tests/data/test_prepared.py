@@ -480,7 +480,7 @@ def test_a_run_is_told_the_columns_too(wide, tmp_path):
     assert "6 columns, no" in in_process(tmp_path, given, check=False).refusal
 
 
-def test_labels_are_kept_where_each_scan_has_them(r2flow, clouds: Path, tmp_path: Path):
+def test_labels_are_kept_where_scans_have_them(r2flow, clouds: Path, tmp_path: Path):
     root = Path(shutil.copytree(clouds, tmp_path / "scans"))
     scans = sorted(root.rglob("*.bin"))
     for number, scan in enumerate(scans):
@@ -502,10 +502,12 @@ def test_labels_are_kept_where_each_scan_has_them(r2flow, clouds: Path, tmp_path
     data.setup()
     assert next(iter(data.train_dataloader()))["x_1"].shape == (4, 2 + len(COMMON), 4, 16)
     other = ScanDataModule("prepared", root=f"{tmp_path}/plain", sensor=SMALL, encoding=encoding)
-    with refused("plain holds scans without labels. Prepare points that each have a file of"):
+    with refused("plain holds scans without labels. Prepare points that have files of labels"):
         other.setup()
     # Changed labels are refused as changed scans are.
     scans[0].with_suffix(".label").write_bytes(bytes(800))
     assert "scans-000000.safetensors holds scans of other files" in r2flow(*typed).refusal
-    scans[0].with_suffix(".label").unlink()
+    for scan in scans:
+        assert "label" in plan_of(root).codes
+        scan.with_suffix(".label").unlink()
     assert "label" not in plan_of(root).codes

@@ -118,6 +118,14 @@ def test_several_seeds_are_one_line_with_mean_and_spread(tmp_path):
         assert cell(_group_rows(group_runs(read_runs([tmp_path])))[0], "val_last") == str(value)
 
 
+def test_a_group_is_named_by_what_its_runs_share_and_counts_those_that_started(tmp_path):
+    for seed, started in ((0, 40), (1, 40), (2, None)):
+        make_run(tmp_path / f"net-s{seed}", {"seed": seed}, checkpoint=started)
+    ((name, runs),) = group_runs(read_runs([tmp_path])).items()
+    assert name == "net-s"
+    assert _group_rows({name: runs})[0]["n"] == "2 of 3"
+
+
 def test_two_sweeps_are_told_apart_by_what_was_swept(tmp_path):
     for loss, seed in (("mse", 1), ("mse", 2), ("absolute", 1), ("absolute", 2)):
         make_run(
@@ -198,7 +206,10 @@ def test_the_page_is_written_with_its_picture(tmp_path):
     written = {path.name: path for path in write_page(compare_page(groups), tmp_path / "out")}
     assert set(written) == {"compare.md", "compare.json", "compare.png", "compare.pdf"}
     said = written["compare.md"].read_text()
-    for words in ("| bare | 1 | rectify | simulated | hdit |", "| run | train loss, last tenth |"):
+    for words in (
+        "| bare | 0 of 1 | rectify | simulated | hdit |",
+        "| run | train loss, last tenth |",
+    ):
         assert words in said, words
     rows = json.loads(written["compare.json"].read_text())["rows"]
     assert [row["name"] for row in rows] == ["bare", "full"]

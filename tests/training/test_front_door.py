@@ -20,6 +20,7 @@ from r2flow.data.datamodule import ScanDataModule
 from r2flow.generators import build_generator
 from r2flow.lidar.sensors import SENSORS, build_sensor, write_sensor
 from r2flow.model.config import RunConfig, TrainerOptions
+from r2flow.runs import launch
 from r2flow.runs.folder import CONFIG, RESUMED, open_run, read_config
 from r2flow.training import build, check, compose
 from tests.conftest import refused
@@ -354,3 +355,20 @@ def test_a_misspelt_config_is_answered_without_loading_torch(tmp_path: Path):
         command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False
     )
     assert (done.stdout, len(done.stderr.splitlines())) == (4 * "2 False\n", 4), done.stderr
+
+
+@pytest.mark.parametrize(("options", "value"), [([], 0.25), (["metric=bend"], 3.5), (["metric=x"], None)])  # fmt: skip
+def test_a_job_of_a_sweep_returns_its_last_metric(tmp_path, monkeypatch, options, value):
+    returned = []
+    sweep_job = launch._sweep_job
+    monkeypatch.setattr(launch, "_sweep_job", lambda *args: returned.append(sweep_job(*args)))
+
+    def run_process(command: list[str]) -> int:
+        run = Path(command[-1].partition("=")[2].strip("'"))
+        logged = "step,val/loss,bend\n9,0.75,\n19,0.25,\n19,,3.5\n"
+        write_file(run / "metrics" / "version_0" / "metrics.csv", logged)
+        return 0
+
+    monkeypatch.setattr(launch, "run_process", run_process)
+    in_process(tmp_path, ["-m", "seed=1,2", *options])
+    assert returned == [value, value]

@@ -30,13 +30,6 @@ SCALES = np.radians(np.geomspace(1, 0.005, 8))  # of the residual, from coarse t
 # Standard deviations of what is fitted: tilts, and the laser's position in metres.
 PRIOR = np.repeat([np.radians(1), np.radians(1), 0.3, 0.3, 0.3], KNOTS)
 
-# SemanticKITTI's ids of PandaSet's classes 0 to 42: smoke, exhaust, rain and reflections are
-# outliers; pickups are trucks and driveways sidewalk, as SemanticKITTI defines them.
-CLASSES = np.array([
-    0, 1, 1, 1, 1, 70, 49, 40, 60, 60, 60, 48, 48, 10, 18, 18, 18, 20, 15, 20, 20, 20,
-    20, 13, 99, 15, 11, 16, 16, 16, 30, 30, 99, 99, 80, 51, 81, 99, 81, 51, 99, 50, 99,
-], np.uint16)  # fmt: skip
-
 
 def read_frame(path: Path) -> Cloud:
     """x, y, z, intensity (0 to 255) and time (s) of the points of the Pandar64 (`d == 0`)."""
@@ -78,12 +71,11 @@ def labels_of(path: Path) -> Path:
 
 
 def read_classes(labels: Path, frame: Path) -> ndarray:
-    """SemanticKITTI's id of each point of `read_frame`, (N,) uint16."""
+    """PandaSet's class of each point of `read_frame`, (N,)."""
     classes = column(read_table(labels), "class")
     spinning = column(read_table(frame), "d") == 0
     check(len(classes) == len(spinning), f"it is not of {frame}: they differ in length.")
-    known = (classes >= 0) & (classes < len(CLASSES))
-    return CLASSES[np.where(known, classes, 0).astype(int)][spinning]
+    return classes[spinning].astype(int)
 
 
 def _in_vehicle(world: ndarray, times: ndarray, folder: Path) -> ndarray:

@@ -22,7 +22,7 @@ from r2flow.data.sources import (
     spread,
     warn_of_other_sensor,
 )
-from r2flow.lidar.labels import labels_beside
+from r2flow.lidar.labels import SEMANTIC_KITTI, labels_beside
 from r2flow.lidar.scan_files import points_beside, read_range_image
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.reports.tables import short_names
@@ -99,7 +99,9 @@ def _read_labels(source: ScanSource, number: int) -> ndarray | None:
         file = labels_beside(path)
         if file and read_range_image(path) is None:
             reading = replace(source.reading, on_bad_scan="error")
-            return read_labelled_scan(path, file, reading)[1][None]
+            # ids of an unknown list are shown by their numbers
+            ids = None if reading.label_ids is SEMANTIC_KITTI else reading.label_ids
+            return read_labelled_scan(path, file, reading, ids)[1][None]
     return None
 
 

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from torch import Tensor
 
 from r2flow.base.errors import InputError
-from r2flow.base.files import reading_errors
+from r2flow.base.files import parse_yaml, reading_errors
 from r2flow.base.registry import Config, Options
 from r2flow.lidar.encoding import ShiftedLog
 from r2flow.lidar.sensors import build_sensor
@@ -177,7 +176,7 @@ def _notes(path: Path) -> Options:
     """Read the published `config.yaml` next to a file; empty if missing."""
     file = path.with_name("config.yaml")
     with reading_errors(file):
-        content = yaml.safe_load(file.read_text()) if file.is_file() else {}
+        content = parse_yaml(file.read_text()) if file.is_file() else {}
     return content if isinstance(content, Mapping) else {}
 
 
