@@ -1,0 +1,75 @@
+"""Scans of a torch `Dataset` of one's own."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from r2flow.data.layouts import SourceKind
+from r2flow.data.reading import Reading
+from r2flow.data.sources import ScanSource, spread
+
+if TYPE_CHECKING:
+    from r2flow.data.opening import Described
+
+_LOOKED_AT = 8  # scans whose values identify the data set
+
+
+class DatasetScans(ScanSource):
+    """Items of a map-style `Dataset`: images (2 or 1, H, W), range in metres and reflectance in
+    [0, 1], 0 without a return, or dicts with such an `image`.
+    """
+
+    slow = True
+
+    def __init__(self, dataset: Any, indices: Sequence[int] | None = None) -> None:
+        self.dataset = dataset
+        self.indices = range(len(dataset)) if indices is None else indices
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        item = self.dataset[self.indices[index]]
+        image = item["image"] if isinstance(item, dict) else item
+        return torch.as_tensor(image, dtype=torch.float32).numpy()
+
+    @property
+    def names(self) -> list[str]:
+        return [str(index) for index in self.indices]
+
+    @property
+    def contents(self) -> str:  # type: ignore[override]
+        looked_at = [self[index].tobytes() for index in spread(len(self), _LOOKED_AT)]
+        return hashlib.sha256(b"".join(looked_at)).hexdigest()
+
+    def subset(self, indices: Sequence[int]) -> "DatasetScans":
+        return DatasetScans(self.dataset, [self.indices[index] for index in indices])
+
+
+@dataclass(frozen=True)
+class DatasetKind(SourceKind):
+    """Scans of `make(root)`, a map-style `Dataset` (`DatasetScans`); root is None if not given.
+
+    Its images have the size of the run's sensor.
+    """
+
+    make: Callable[[Path | None], Any]
+    sensor: str = "hdl64e"
+    levels: int | None = None
+
+    def open(
+        self, scans: "Described", reading: Reading, seed: int = 0, first_scene: int = 0
+    ) -> DatasetScans:
+        return DatasetScans(self._made(scans))
+
+    def lacks_reflectance(self, scans: "Described", on_bad_scan: str = "error") -> str | None:
+        channels = len(DatasetScans(self._made(scans))[0])
+        return f"the images of {scans.options.name} have one channel" if channels == 1 else None
+
+    def _made(self, scans: "Described") -> Any:
+        return self.make(None if scans.options.root is None else scans.options.folder)

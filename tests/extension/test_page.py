@@ -1,0 +1,51 @@
+"""docs/extend.md: every block is a plug-in that works."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from r2flow.metrics import METRICS
+from tests.conftest import ROOT
+from tests.extension.conftest import TINY, loaded, r2flow
+
+BLOCKS = dict(
+    re.findall(
+        r"^```python\n# (\w+)\.py\n(.*?)^```", (ROOT / "docs/extend.md").read_text(), re.M | re.S
+    )
+)
+
+
+@pytest.fixture
+def plugins(tmp_path: Path, monkeypatch) -> Iterator[Path]:
+    monkeypatch.chdir(tmp_path)
+    for name, code in BLOCKS.items():
+        Path(f"{name}.py").write_text(code)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("name", "choices"),
+    [
+        ("my_backbone", ["backbone=my_backbone", "backbone.channels=4"]),
+        ("near_loss", ["stage=near_loss", "stage.weight=2"]),
+        ("corridors", ["data=corridors", "backbone=hdit_tiny"]),
+    ],
+)
+def test_a_plug_in_of_the_page_trains(plugins: Path, name: str, choices: list[str]):
+    tiny = [one for one in TINY if name != "corridors" or not one.startswith("data.scenes")]
+    done = r2flow("train", f"--plugin={name}.py", *tiny, *choices, "run_dir=run")
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_metric_of_the_page_is_a_difference_of_means(plugins: Path):
+    import torch
+
+    with loaded():
+        exec(BLOCKS["mean_range"], {})
+        metric = METRICS["mean_range"](sensor="hdl64e_small")
+        for r, real in ((10.0, True), (12.5, False)):
+            metric.update(torch.full((3, 1, 32, 256), r), real=real)
+        assert metric.compute() == {"mean_range": pytest.approx(2.5)}
+        del METRICS._entries["mean_range"]
