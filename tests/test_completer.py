@@ -126,6 +126,15 @@ def test_errors_name_arguments_of_python(flow, change, options, message):
         flow.completer("vlp16", **options)(rows)
 
 
+def test_times_and_rings_that_are_all_zero_stay_so(flow):
+    """Drivers without them write 0."""
+    rows = room()
+    rows["t"] = rows["ring"] = 0
+    found = flow.completer("vlp16")(rows)
+    assert not found["t"].any()
+    assert not found["ring"].any()
+
+
 def test_times_that_are_none_may_be_passed_through(flow):
     rows = room()
     rows["t"] = 7

@@ -62,11 +62,14 @@ def completed_cloud(
 
     for axis, values in zip("xyz", xyz.T, strict=True):
         fill(axis, values)
-    fill("ring", row)
+    ring = cloud.column("ring")
+    fill("ring", row if ring is not None and ring.any() else np.zeros(count))
     silent = points.reflectance is None or not points.reflectance.any()
     fill("reflectance", np.zeros(count) if silent else strength * given.scale)
     time = cloud.column("time")
-    if time is not None and count:
+    if time is not None and not time.any():
+        fill("time", np.zeros(count))
+    elif time is not None and count:
         azimuth = np.arctan2(*points.xyz.T[1::-1].astype(float))
         asked = np.arctan2(*xyz.T[1::-1].astype(float))
         name = (cloud.names or cloud.aliases)[cloud.place("time") or 0]

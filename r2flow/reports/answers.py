@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -17,19 +17,14 @@ from r2flow.lidar.other_sensors import Partial
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import Completed, complete
 from r2flow.reports.answer_counts import Counts, print_counts
-from r2flow.reports.answer_errors import (
-    COMPARE,
-    Compared,
-    Errors,
-    compared,
-    in_words,
-    write_errors,
-)
 from r2flow.reports.answer_files import answer_files, check_inputs, write_answers
 from r2flow.reports.answer_pictures import draw_answers
 from r2flow.reports.answer_rays import Job, known_rays, measured_rays
 from r2flow.reports.outputs import recipe_of
 from r2flow.store import Store, manifest_of
+
+if TYPE_CHECKING:
+    from r2flow.reports.answer_errors import Compared, Errors
 
 _THREADS = 4  # at most: Python's own work is done by one thread at a time
 
@@ -106,6 +101,8 @@ def write_completed(
             scan = scans[number]
             beside: Compared | None = None
             if job.mask is not None and "range" not in job.hide:
+                from r2flow.reports.answer_errors import compared, write_errors  # slow
+
                 measured = measured_rays(scan, job)
                 beside = compared(measured, given, completed, checkpoint.sensor)
                 errors[scan.name] = beside.errors
@@ -116,6 +113,8 @@ def write_completed(
         bar.set(len(left) * job.num)
     print_counts(checkpoint.sensor, counts)
     if errors:
+        from r2flow.reports.answer_errors import COMPARE, in_words
+
         print(f"{in_words([*errors.values()])}; see {out / COMPARE}")
     written = f"{len(left)} scan{'' if len(left) == 1 else 's'} written to {out}"
     skipped = [f"{len(scans) - len(left)} there already"] if len(left) < len(scans) else []
