@@ -56,6 +56,18 @@ def test_the_patch_of_a_camera_is_no_turn(r2flow, tmp_path, columns, step, rows)
     assert not out.exists()
 
 
+def test_scans_of_two_sensors_in_one_command_are_refused(r2flow, tmp_path):
+    """None is read as the other's: their beams, and so all rows, differ."""
+    for sensor in ("vlp16", "os1_64"):
+        xyz = street(sensor)
+        write_points(tmp_path / f"{sensor}.bin", xyz, np.full(len(xyz), 0.5))
+    both = [tmp_path / "vlp16.bin", tmp_path / "os1_64.bin"]
+    for scans in (both, [tmp_path]):
+        for verb in (("complete", *scans, "--out", tmp_path / "o"), ("sensor", *scans)):
+            assert "are of two sensors" in r2flow(*verb).refusal
+    assert not (tmp_path / "o").exists()
+
+
 def test_sensor_says_of_a_doubtful_reflectance_what_show_says(r2flow, tmp_path):
     """9 % above 1, half of all below 0.6: 255 may be full reflectance, or not."""
     xyz = street()

@@ -135,6 +135,7 @@ def reading(path: Path, largest: int, what: str = "file", least: int = 1) -> Ite
                 else "not a regular file"
             )
             raise InputError(f"{path} is {kind}.")
+        _refuse_pointer(path, size)
         if size < least:
             raise InputError(f"{path} is empty ({size} bytes); fetch or write it again.")
         if size > largest:
@@ -144,6 +145,17 @@ def reading(path: Path, largest: int, what: str = "file", least: int = 1) -> Ite
                 "Is it another file?"
             )
         yield
+
+
+def _refuse_pointer(path: Path, size: int) -> None:
+    """Refuse the pointer to a file that Git keeps elsewhere."""
+    if size > 1024:
+        return
+    start = path.read_bytes()
+    if start.startswith(b"version https://git-lfs"):
+        raise InputError(f"{path} is a Git LFS pointer, not the file itself: git lfs pull.")
+    if b"/annex/objects/" in start[:32]:
+        raise InputError(f"{path} is a git-annex pointer, not the file itself: git annex get.")
 
 
 @contextmanager

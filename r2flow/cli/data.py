@@ -154,7 +154,7 @@ def sensor(
             name = f"my_{name}"
     paths = [points_beside(path) for scan in scans for path in list_scans(scan, most)[0]]
     points = [read_points(path, columns) for path in track(paths, "reading", "scans", least=16)]
-    warn_of_frame(dict(zip(paths, points, strict=True)))
+    warn_of_frame(dict(zip(paths, points, strict=True)), alike=True)
     mine, beams, steps, off, ground = estimate_sensor(points, name)
     degrees = mine.elevations
     nearest, distance = nearest_sensor(beams.elevations)

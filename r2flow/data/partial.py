@@ -198,6 +198,7 @@ def sight(
     spec = described.label
     own = SENSORS[target.name] if target.name in SENSORS else target  # noqa: SIM401
     doubt = other_sensor(scans, source or own)
+    named = source is not None
     if not source and not doubt and own.shape[0] < target.shape[0]:
         source = own  # fewer beams than rows of the completions
     same = doubt is None
@@ -209,7 +210,7 @@ def sight(
     for file, points in read.items():
         with naming(file):
             check_rings(points)
-    odd = bool(stored) or warn_of_frame(read)
+    odd = bool(stored) or warn_of_frame(read, alike=not named)
     try:
         fired = sensor_of(scans, known)
     except InputError as error:

@@ -163,11 +163,11 @@ def mismatch_of(paths: Sequence[str | Path], reading: Reading, ours: bool) -> Do
     return None if unclear and not (mismatch and mismatch.sure) else mismatch
 
 
-def warn_of_frame(scans: Mapping[Any, Points]) -> bool:
+def warn_of_frame(scans: Mapping[Any, Points], alike: bool = False) -> bool:
     """Warn, once per folder, of scans (by path) not in one sensor's own frame; whether they are
     not.
 
-    Warns of files of several turns, too.
+    Warns of files of several turns, too. With `alike`, scans of two sensors are an InputError.
     """
     points = [*scans.values()]
     path = Path(next(iter(scans)))
@@ -181,6 +181,7 @@ def warn_of_frame(scans: Mapping[Any, Points]) -> bool:
         )
     if pair := differing(points):
         seen = " and ".join(f"{[*scans][n]} ({in_words(beams)})" for n, beams in pair)
+        check(not alike, f"{seen} are of two sensors: give the scans of each by themselves.")
         warn_odd(path, f"read as scans of one sensor, but {seen} are of two: read them apart")
         return True
     unclear = is_unclear(points)

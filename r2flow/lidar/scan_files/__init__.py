@@ -205,8 +205,10 @@ def read_range_image(path: str | Path) -> ndarray | None:
     ranges = image[0]
     wrong = (ranges < 0) | (ranges > FARTHEST_RAY)
     count = int(np.count_nonzero(wrong))
-    if 2 * count > np.count_nonzero(ranges):
-        found = ranges[wrong]
+    found = ranges[wrong]
+    # one value alone, as -1, stands for no return, however many have none
+    several = count and (found != found[0]).any()
+    if several and 2 * count > np.count_nonzero(ranges):
         raise InputError(
             f"{path}: most of its ranges are below 0 or above {FARTHEST_RAY:g} m, from "
             f"{found.min():.3g} to {found.max():.3g}. Are these millimetres, or a scan in model "

@@ -14,7 +14,7 @@ from typing import IO
 import numpy as np
 from numpy import ndarray
 
-from r2flow.base.errors import InputError, require
+from r2flow.base.errors import InputError, check, quoted, require
 from r2flow.lidar.scan_files.cloud import Cloud
 
 PLY_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -22,6 +22,7 @@ PLY_CODES = {  # NumPy's codes of PLY's types
     "char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I",
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I",
     "float": "f", "double": "d", "float32": "f", "float64": "d",
+    "bool": "B",  # Open3D's
 }  # fmt: skip
 PLY_TYPES = {  # by NumPy's
     "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint",
@@ -113,11 +114,13 @@ def read_ply(path: Path) -> Cloud:
     head, vertex, *others = text.split("\nelement ")
     _, encoding, _ = re.split(r"^format (\w+)", head, flags=re.MULTILINE)
     properties = re.findall(r"^property (\w+) (.+)", vertex, re.MULTILINE)
-    codes = [PLY_ORDERS[encoding] + PLY_CODES[kind] for kind, _ in properties]
-    row = np.dtype([(str(number), code) for number, code in enumerate(codes)])
     name, count = vertex.split()[:2]
     if name != "vertex":
         raise InputError("its first element is not 'vertex', the points.")
+    for kind, named in properties:
+        check(kind in PLY_CODES, f"its vertices have a property {quoted(named)}, a {kind}.")
+    codes = [PLY_ORDERS[encoding] + PLY_CODES[kind] for kind, _ in properties]
+    row = np.dtype([(str(number), code) for number, code in enumerate(codes)])
     names = tuple(name.strip() for _, name in properties)
     columns = tuple(_columns(body, row, int(count), encoding, last=not others))
     # Stanford's way of an organised cloud.

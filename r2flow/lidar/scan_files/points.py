@@ -1,5 +1,6 @@
 """Points of a scan file, selected from named columns and validated."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -33,6 +34,12 @@ ROLES: Mapping[str, tuple[str, ...]] = {
     "measured": ("measured",),  # r2flow's: 0 for a point that a completion added
 }  # fmt: skip
 _ONCE = ("x", "y", "z", "reflectance", "ring")  # a file's columns name each at most once
+# What no reflectance is called: colours, normals, times, labels, angles and distances.
+_OTHERS = re.compile(
+    "rgba?|[rgbat]|red|green|blue|alpha|colou?rs?.*|n[xyz]|normals?.*|curvature|.*(time|stamp).*"
+    "|ts|dt|t_.*|.*(label|class|instance|segment|index).*|id|range|distance|depth|azimuth|elevation"
+    "|(row|col).*|returns?.*|.*return_?(number|type).*|confidence|v[xyz]|velocity.*"
+)
 _ROLE_OF = {alias: role for role, aliases in ROLES.items() for alias in aliases}
 
 
@@ -197,7 +204,9 @@ def _check_values(size: ndarray, reflectance: ndarray | None, finite: ndarray, r
     returned = size[finite & (size > 0)]  # organised scans store rays without return as (0, 0, 0)
     if not len(returned) and (count or not rows):
         raise NoPointsError(
-            f"it holds no points, but {rows} rays without return; leave it out, or fetch it again."
+            f"it holds no point, only {rows} rays without return: leave it out."
+            if rows
+            else "it holds no points: leave it out."
         )
     far = np.count_nonzero(returned > FARTHEST)
     near = np.count_nonzero(returned < NEAREST)
@@ -227,7 +236,11 @@ def warn_of_unused(
     unused = [
         name
         for name, column in zip(names, columns, strict=True)
-        if name.strip("_") and not role_of(name) and column.ndim == 1 and column.dtype.kind in "fiu"
+        if name.strip("_")
+        and not role_of(name)
+        and not _OTHERS.fullmatch(_plain(name))
+        and column.ndim == 1
+        and column.dtype.kind in "fiu"
     ]
     if unused:
         listed = ", ".join(unused)[:120]

@@ -14,7 +14,7 @@ from numpy import ndarray
 from r2flow.base.errors import InputError, require
 from r2flow.lidar.scan_files.cloud import Cloud
 from r2flow.lidar.scan_files.points import is_renaming, role_of
-from r2flow.lidar.scan_files.widths import fits_width, fitting_widths
+from r2flow.lidar.scan_files.widths import are_metres, fits_width, fitting_widths
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def read_rows(path: Path, columns: Sequence[str] | None) -> Cloud:
     if values[:1].tobytes() == np.lib.format.MAGIC_PREFIX[:4]:
         raise InputError("it is a .npy file: rename it.")
     left = size % (4 * width)
-    if left or not (columns or fits_width(values, width)):
+    if left or not (columns or (fits_width(values, width) and are_metres(values, width))):
         fitting = fitting_widths(values)
         if len(fitting) == 1 and fitting != [width]:
             names = ["x", "y", "z", "intensity", *"_" * WIDEST][: fitting[0]]
@@ -53,6 +53,13 @@ def read_rows(path: Path, columns: Sequence[str] | None) -> Cloud:
                 f"it is made of rows of {fitting[0]} float32, not {width}: name all by --columns "
                 f"{','.join(names)} (_ for what is not used)."
             )
+        for kind in ("float64", "float16") if not fitting else ():
+            others = fitting_widths(np.fromfile(path, kind))
+            if others:
+                raise InputError(
+                    f"it is made of rows of {others[0]} {kind}, not float32: convert it, as "
+                    f"numpy.fromfile(FILE, '{kind}').astype('float32').tofile(OTHER)."
+                )
     if left:
         raise InputError(
             f"it is not made of rows of {width} float32: {left} bytes are left. Is it cut short, "
@@ -215,9 +222,10 @@ def usual_names(width: int, columns: Sequence[str] | None) -> Sequence[str]:
         raise InputError("it does not name its columns: name all, as --columns x,y,z,intensity.")
     names = columns or ("x", "y", "z", "reflectance")[: max(width, 3)]
     if len(names) != width:
+        named = ",".join(["x", "y", "z", "intensity", *"_" * width][: max(width, 3)])
         raise InputError(
-            f"it has {width} columns, not {len(names)}: name all by --columns x,y,z,intensity,_,_ "
-            "(data.reading.columns=[x,y,z,intensity,_,_])."
+            f"it has {width} columns, not {len(names)}: name all by --columns {named} "
+            f"(data.reading.columns=[{named}])."
         )
     return names
 

@@ -3,6 +3,8 @@
 import numpy as np
 from numpy import ndarray
 
+from r2flow.lidar.scan_files.points import FARTHEST, NEAREST
+
 WIDEST = 12
 FEWEST_ROWS = 100  # for a judgement
 PAIRS = 2000  # of neighbouring rows, drawn at random, that are compared
@@ -19,9 +21,20 @@ def fitting_widths(values: ndarray) -> list[int]:
     fitting: list[int] = []
     for width in range(3, WIDEST + 1):
         known = any(width % smaller == 0 for smaller in fitting)
-        if not known and len(values) % width == 0 and fits_width(values, width):
+        whole = not known and len(values) % width == 0
+        if whole and fits_width(values, width) and are_metres(values, width):
             fitting.append(width)
     return fitting
+
+
+def are_metres(values: ndarray, width: int) -> bool:
+    """Whether nearly all rows of a width begin with coordinates that a LiDAR may measure; floats of
+    another size have random exponents.
+    """
+    xyz = values[: len(values) // width * width].reshape(-1, width)[:, :3]
+    size = abs(xyz.astype(float)).max(axis=1)
+    returned = size[size != 0]
+    return bool(np.mean((returned > NEAREST) & (returned < FARTHEST)) > 0.95)
 
 
 def fits_width(values: ndarray, width: int) -> bool:
