@@ -14,6 +14,7 @@ RESULTS = {
     "street.md",
     "densify.md",
     "labels.md",
+    "which_system.md",
     "CHANGELOG.md",
 }  # where measurements belong
 # of a sentence; characters of a row of a table and of another line
