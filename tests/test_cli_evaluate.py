@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 import torch
 
+from r2flow.data import opening
+from r2flow.data.layouts import Layout
 from r2flow.evaluation import comparing
 from r2flow.generators import build_generator
 from r2flow.lidar.projection import image_to_points
@@ -72,6 +74,27 @@ def test_the_json_holds_everything_about_a_figure(r2flow, real, generated, tmp_p
     for words in ("JSD x 10^2", "MMD x 10^4", f"{100 * jsd['figures']['jsd']:#.4g}", "(10 : 12)"):
         assert words in said
     assert len(list((tmp_path / "cache" / "statistics").iterdir())) == 4
+
+
+def test_each_name_is_looked_up_once_and_each_folder_listed_once(
+    r2flow, real, generated, monkeypatch
+):
+    looked: list[str] = []
+    listed: list[str] = []
+    describe, find_drives = opening.describe, Layout.find_drives
+    monkeypatch.setattr(
+        opening,
+        "describe",
+        lambda spec: looked.extend([spec] if isinstance(spec, str) else []) or describe(spec),
+    )
+    monkeypatch.setattr(
+        Layout,
+        "find_drives",
+        lambda kind, options: listed.append(str(options.root)) or find_drives(kind, options),
+    )
+    r2flow("evaluate", real, generated, *QUICK, "--no-reference", "--no-baselines")
+    assert looked == [str(generated), str(real)]
+    assert sorted(listed) == sorted([str(real), str(generated)])
 
 
 def test_a_scale_of_reflectance_is_asked_for_where_it_matters(r2flow, real, tmp_path):

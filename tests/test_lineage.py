@@ -200,6 +200,7 @@ def test_each_set_of_scans_says_its_whole_reading():
             "convention": "reference",
             "columns": None,
             "on_bad_scan": "error",
+            "label_ids": None,
         }
         assert one["reading"] == {**whole, "reflectance_scale": one["reading"]["reflectance_scale"]}
     assert ScanDataModule(**found).described() == found  # a run that is resumed says the same

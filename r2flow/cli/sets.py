@@ -24,6 +24,7 @@ from r2flow.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from r2flow.data.opening import Described
     from r2flow.data.reading import Reading
     from r2flow.data.sets import ScanSet
     from r2flow.metrics.base import ScanMetric
@@ -102,12 +103,12 @@ class EvaluateOptions:
 
 
 def reading_of(
-    how: ReadingOptions, specs: Sequence[str], flows: "Sequence[Checkpoint]"
+    how: ReadingOptions, named: "Sequence[Described]", flows: "Sequence[Checkpoint]"
 ) -> "Reading":
     """How points become images, whatever the order of models and samples: with all returns that any
     of them has.
     """
-    from r2flow.data.opening import PREPARED, describe, reading_for
+    from r2flow.data.opening import PREPARED, reading_for
     from r2flow.metrics.scans import MASK
 
     sensors = {(flow.sensor.shape, flow.sensor.elevations) for flow in flows}
@@ -115,9 +116,8 @@ def reading_of(
         raise InputError(
             "the models have different sensors or image sizes; measure each by itself."
         )
-    reading = how.reading(specs, next(iter(flows), None))
+    reading = how.reading(named, next(iter(flows), None))
     sets = [reading_for([], flow) for flow in flows]
-    named = [describe(spec) for spec in specs]
     sets += [scans.stored for scans in named[1:] if scans.stored]
     prepared = any(scans.options.name == PREPARED for scans in named)
     if (how.sensor and not flows) or not sets or prepared:
@@ -129,10 +129,11 @@ def reading_of(
     return replace(reading, sensor=sensor, convention=reading.convention if agreed else "centre")
 
 
-def open_set(text: str, reading: "Reading", split: str | None, num: int | None) -> "ScanSet":
-    from r2flow.data.opening import describe, open_scans
+def open_set(
+    described: "Described", reading: "Reading", split: str | None, num: int | None
+) -> "ScanSet":
+    from r2flow.data.opening import open_scans
 
-    described = describe(text)
     scans = open_scans(described, reading, split, num)
     described.refuse_parts()
     _ = scans.source[0]  # fail before the other set is read
@@ -142,6 +143,7 @@ def open_set(text: str, reading: "Reading", split: str | None, num: int | None) 
 def judged_sets(
     named: Sequence[str],
     flows: "Mapping[str, Checkpoint]",
+    files: "Mapping[str, Described]",
     reading: "Reading",
     options: EvaluateOptions,
 ) -> "dict[str, ScanSet]":
@@ -153,7 +155,7 @@ def judged_sets(
         if text in flows:
             sets |= _sampled(name, flows[text], options)
         else:
-            sets[name] = open_set(text, reading, None, options.num)
+            sets[name] = open_set(files[text], reading, None, options.num)
     return sets
 
 

@@ -184,7 +184,14 @@ class Described:
 
     def part(self, **options: Any) -> "Described":
         """These scans with other options, such as a split."""
-        return Described(self.label, replace(self.options, **options), self.file)
+        part = Described(self.label, replace(self.options, **options), self.file)
+        if (part.options.name, part.options.root) == (
+            self.options.name,
+            self.options.root,
+        ):  # looked up once
+            known = ("manifest", "stored", "made_here")
+            vars(part).update({key: vars(self)[key] for key in known if key in vars(self)})
+        return part
 
     def open(self, reading: Reading, seed: int = 0, first_scene: int = 0) -> ScanSource:
         """Open the scans by `SourceKind.open`, after resolving `reading.reflectance`."""
