@@ -17,6 +17,8 @@ from r2flow.data.options import (
     ReadingOptions,
     SourceOptions,
 )
+from r2flow.data.reading import scaled_reflectance
+from r2flow.data.sources import readable
 from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
 
 Options = TypeVar("Options", bound=SourceOptions)
@@ -149,6 +151,20 @@ def lacking_reflectance(sets: Sequence[Described]) -> str | None:
     """
     reasons = (one.kind.lacks_reflectance(one, one.options.chosen["on_bad_scan"]) for one in sets)
     return next(filter(None, reasons), None)
+
+
+def check_intensities(plan: DataPlan) -> None:
+    """Look at the first scan of each set of files, before any work.
+
+    Raises:
+        InputError: its reflectance goes beyond the scale that training would divide it by.
+    """
+    for scans in filter(None, (*plan.sets, plan.held_out, plan.scans)):
+        reading = scans.options.reading
+        if isinstance(scans.kind, Layout) and reading and reading.on_bad_scan != "skip":
+            for points in readable(scans.paths[:1], reading.columns):
+                if points.reflectance is not None:
+                    scaled_reflectance(scans.paths[0], points, reading.reflectance_scale)
 
 
 def reflectance_levels(sets: Sequence[Described]) -> int | None:

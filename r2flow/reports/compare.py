@@ -94,7 +94,7 @@ def _group_rows(groups: Groups) -> list[Row]:
     rows = []
     for label, runs in groups.items():
         started = sum(run.values["steps"] is not None for run in runs)
-        row = {
+        row: Row = {
             "name": label,
             "n": len(runs) if started == len(runs) else f"{started} of {len(runs)}",
         }

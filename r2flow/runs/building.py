@@ -22,6 +22,7 @@ from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 from r2flow.callbacks.loggers import LOGGERS, LearningRates
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions, ReadingOptions
+from r2flow.data.resolving import check_intensities
 from r2flow.model.config import RunConfig
 from r2flow.model.lineage import Parent, find_parent, model_options
 from r2flow.model.parts import MODEL, config_of
@@ -112,12 +113,14 @@ def build(
 def check(
     config: Options | RunConfig, asked: Sequence[str] = (), parent: Parent | None = None
 ) -> RunConfig:
-    """Check a config by building its run; no files are written.
+    """Check a config by building its run and looking at a scan; no files are written.
 
     The result is completed with values of its parent; `parent` is one that has not been trained
     yet.
     """
     run = build(config, asked, parent)
+    if run.stage.encoding.reflectance:
+        check_intensities(run.data.plan)
     check_run(run.folder, run.config.plain())
     return run.config
 

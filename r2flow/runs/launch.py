@@ -150,6 +150,10 @@ def _run_hydra(
                     f"plug-ins are named on the command line, never in a file: give {named}."
                 )
             if HydraConfig.get().mode == RunMode.MULTIRUN:
+                if HydraConfig.get().job.num == 0:
+                    _look_at_scans(config, given)
+                if any(not isinstance(error, _JobEnded) for error in errors):
+                    return None  # all jobs would end as the first one
                 return _sweep_job(command, given, config["metric"])
             settings = plain(config)
             # imported here, so that Hydra's errors are reported before torch is loaded
@@ -185,6 +189,23 @@ def job_folder(given: Sequence[str], overrides: str) -> str:
     parts = [part for part in whole if part.partition("=")[0].lstrip("+~") in swept]
     readable = re.sub(r"[^\w.=+-]+", "_", ",".join(parts) or "job")[:80]
     return f"{readable}-{hashlib.sha256(os.fsencode(overrides)).hexdigest()[:6]}"
+
+
+def _look_at_scans(config: DictConfig, given: Sequence[str]) -> None:
+    """Refuse scans in files that no job of a sweep could train on, once; what else is wrong with a
+    job, that says itself.
+    """
+    if config["chain"] or config["data"]["name"] in ("simulated", "pairs"):
+        return
+    from r2flow.data.resolving import check_intensities
+    from r2flow.training import build
+
+    try:
+        run = build(plain(config), given)
+    except InputError:
+        return
+    if run.stage.encoding.reflectance:
+        check_intensities(run.data.plan)
 
 
 def _sweep_job(command: Sequence[str], given: Sequence[str], metric: str) -> float | None:

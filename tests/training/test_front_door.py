@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from r2flow.callbacks.checkpoints import AtomicCheckpointIO
 
@@ -18,6 +19,7 @@ from r2flow.base.errors import InputError, one_line
 from r2flow.base.files import write_file
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.generators import build_generator
+from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, build_sensor, write_sensor
 from r2flow.model.config import RunConfig, TrainerOptions
 from r2flow.runs import launch
@@ -372,3 +374,31 @@ def test_a_job_of_a_sweep_returns_its_last_metric(tmp_path, monkeypatch, options
     monkeypatch.setattr(launch, "run_process", run_process)
     in_process(tmp_path, ["-m", "seed=1,2", *options])
     assert returned == [value, value]
+
+
+@pytest.mark.parametrize("command", [["-m", "seed=1,2"], ["experiment=demo"]])
+def test_intensities_beyond_their_scale_are_refused_once_before_any_work(
+    tmp_path, monkeypatch, command
+):
+    points = np.random.default_rng(0).normal(0, 10, (500, 3)).astype(np.float32)
+    bright = np.arange(500, dtype=np.float32) % 250 + 1
+    write_points(tmp_path / "scans" / "a.bin", points, bright)
+    monkeypatch.setattr(launch, "run_process", pytest.fail)
+    monkeypatch.setattr(launch, "_draw_preview", pytest.fail)
+    scans = ["data=folder", f"data.root={tmp_path / 'scans'}", "trainer.accelerator=cpu"]
+    said = in_process(tmp_path, [*command, *scans], check=False).refusal
+    assert "reflectance must lie in [0, 1], found up to 250" in said
+    assert "data.reading.reflectance_scale=255" in said
+
+
+def test_a_report_of_a_chain_that_was_interrupted_is_made_by_the_next_run(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr("r2flow.runs.folder.has_ended", lambda run: True)
+    monkeypatch.setattr("r2flow.runs.chain.train_links", lambda links: 0)
+    monkeypatch.setattr("r2flow.reports.chain.report_chain", lambda runs, out, device: made.append(out))  # fmt: skip
+    write_file(tmp_path / "runs" / "demo" / "report" / "steps.png", "of a killed process")
+    in_process(tmp_path, ["experiment=demo", "preview=null"])
+    assert made == [Path("runs/demo/report")]
+    write_file(tmp_path / "runs" / "demo" / "report" / "compare.md", "the last file")
+    in_process(tmp_path, ["experiment=demo", "preview=null"])
+    assert len(made) == 1
