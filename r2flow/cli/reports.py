@@ -6,7 +6,7 @@ import logging
 import math
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from typer import Argument, Option
 
@@ -324,6 +324,9 @@ def compare(
     group: Annotated[
         bool, Option("--group", help="Join the seeds of a configuration: mean ± spread.")
     ] = False,
+    format: Annotated[
+        Literal["text", "tex"], Option(help="Of the printed tables; tex: LaTeX with booktabs.")
+    ] = "text",
 ) -> None:
     """Compare runs: loss, bend, parameters, cost."""
     from r2flow.reports.compare import compare_page, group_runs, print_comparison
@@ -334,6 +337,6 @@ def compare(
     groups = group_runs(compared) if group else {run.label: [run] for run in compared}
     if out is not None:
         check_folder(out)
-    print_comparison(groups)
+    print_comparison(groups, tex=format == "tex")
     if out is not None:
         print(*write_page(compare_page(groups), out), sep="\n")

@@ -11,7 +11,7 @@ from r2flow.base.config import flatten
 from r2flow.model.config import learned
 from r2flow.reports.pages import Page
 from r2flow.reports.runs import ComparedRun
-from r2flow.reports.tables import Row, print_table, table
+from r2flow.reports.tables import Row, latex, print_table, table
 from r2flow.reports.training import curves_figure
 from r2flow.runs.folder import read_config
 
@@ -135,11 +135,18 @@ def _tables(groups: Groups) -> dict[str, tuple[list[Row], dict[str, str]]]:
     return {"Runs": (text, {**name, "n": "n", **_SETTINGS}), "Results": (text, name | measured)}
 
 
-def print_comparison(groups: Groups) -> None:
-    """Print the tables, and which runs cannot be compared by their losses."""
+def print_comparison(groups: Groups, tex: bool = False) -> None:
+    """Print the tables, for a terminal or in LaTeX, and which runs cannot be compared by their
+    losses.
+    """
     for title, (rows, columns) in _tables(groups).items():
+        if tex:
+            print(f"% {title}\n{latex(rows, columns)}")
+            continue
         print_table(rows, columns, title)
         print()
+    if tex:
+        return
     runs = [run.values for group in groups.values() for run in group]
     compared = ("images", "stage", "loss", "data")
     differ = [key for key in compared if len({str(run[key]) for run in runs}) > 1]

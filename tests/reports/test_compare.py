@@ -126,6 +126,16 @@ def test_a_group_is_named_by_what_its_runs_share_and_counts_those_that_started(t
     assert _group_rows({name: runs})[0]["n"] == "2 of 3"
 
 
+def test_compare_prints_tables_for_papers(r2flow, tmp_path):
+    for seed, value in enumerate([0.2, 0.4]):
+        make_run(tmp_path / f"net_a-seed={seed}", {"seed": seed}, val=[value], checkpoint=40)
+    printed = r2flow("compare", tmp_path, "--group", "--format", "tex").stdout
+    assert printed.count(r"\begin{tabular}") == printed.count(r"\end{tabular}") == 2
+    # mean 0.3, standard deviation of 0.2 and 0.4: sqrt(0.02)
+    assert r"net\_a & " in printed
+    assert r"0.3 $\pm$ 0.141" in printed
+
+
 def test_two_sweeps_are_told_apart_by_what_was_swept(tmp_path):
     for loss, seed in (("mse", 1), ("mse", 2), ("absolute", 1), ("absolute", 2)):
         make_run(
