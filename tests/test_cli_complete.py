@@ -115,7 +115,7 @@ def test_a_masked_scan_is_completed_in_its_own_format(r2flow, run, tmp_path, end
         assert both == {*map(tuple, given.xyz[known])}  # to the bit, and nothing hidden
         assert both == {*map(tuple, answered.xyz[: known.sum()])}  # before the new points
     assert (tmp_path / "out" / "one.png").stat().st_size > 10_000
-    assert "what is known" in (tmp_path / "out" / "one.html").read_text()
+    assert "your scan" in (tmp_path / "out" / "one.html").read_text()
 
 
 def test_a_sparser_sensor_is_found_and_its_points_come_back(complete, tmp_path):

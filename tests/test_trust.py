@@ -1,12 +1,22 @@
 """Errors of added points, from the density of the range of each ray."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
+from r2flow.base.errors import InputError
 from r2flow.generators.answers import NEVER, Answers
+from r2flow.generators.calibration import fitted, mixture
+from r2flow.lidar.known import ray_states
+from r2flow.lidar.sensors import read_sensor, write_sensor
+from r2flow.model.completion import complete
+from r2flow.reports.calibration import TASKS, trust_of
+from r2flow.reports.completion import kept_rays
+from tests.test_completion import halved, network
+from tests.test_sampling import scans
 
 
 def density(logits: Tensor, ranges: Tensor, scales: Tensor, returns: float = 0.0) -> Answers:
@@ -54,3 +64,90 @@ def test_measured_rays_and_those_without_a_return_have_no_error():
     found = hidden.error(torch.tensor([[[[3.0, 0.0]]]]), [0.68])
     assert found[0, 0, 0, 0] > 0
     assert found[0, 0, 0, 1] == 0
+
+
+def test_calibration_leaves_a_density_as_it_is_and_widens_it_as_its_weights_say():
+    logits = torch.tensor([[0.0], [-50.0]]).log_softmax(0)
+    ranges = torch.tensor([[2.0], [3.0]])
+    scales = torch.tensor([[0.1], [0.1]])
+    plain = [[0.0] * 3, [-30.0, 0, 0], [-30.0, 0, 0], [0.0] * 3, [0.0] * 3]
+    found = mixture(torch.tensor(plain), logits, ranges, scales)
+    torch.testing.assert_close(found[0][:2].exp(), logits.exp())
+    torch.testing.assert_close(found[2][:2], scales)
+    assert found[0][2].exp() < 1e-12
+    weights = torch.tensor(plain)
+    weights[0, 0] = math.log(3)  # a = 3
+    weights[1, 0] = math.log(0.4) + 2  # c / r = 0.4 at log r = 2
+    weights[2, 0] = 0.0  # half for the wide candidate
+    weights[3, 0] = math.log(2)  # of twice the spread, 0.1
+    logits, ranges, scales = mixture(weights, logits, ranges, scales)
+    torch.testing.assert_close(scales[:, 0], torch.tensor([0.5, 0.5, 0.2]))
+    torch.testing.assert_close(ranges[2], torch.tensor([2.0]))
+    torch.testing.assert_close(logits.exp()[:, 0], torch.tensor([0.5, 0.0, 0.5]))
+
+
+def test_the_fit_finds_how_much_too_narrow_densities_are():
+    draws = torch.Generator().manual_seed(0)
+    b = 10 ** (-2 + torch.rand(20_000, generator=draws))
+    signs = torch.rand(20_000, generator=draws) - 0.5
+    log_r = 2.5 - 2 * b * signs.sign() * torch.log1p(-2 * signs.abs())  # of twice the scale
+    zeros = torch.zeros(1, 20_000)
+    logits = torch.randn(20_000, generator=draws)
+    returned = torch.rand(20_000, generator=draws) < (2 * logits + 1).sigmoid()
+    found = fitted([(zeros, zeros + 2.5, b[None])], log_r, logits, returned)
+    assert found.returns == pytest.approx((2, 1), abs=0.15)
+    answers = density(torch.cat([zeros, zeros + NEVER]), zeros.expand(2, -1) + 2.5, b.expand(2, -1))
+    r = torch.full((1, 1, 1, 20_000), math.exp(2.5))
+    errors = replace(answers, calibration=found).error(r, [0.68, 0.95])[:, 0, 0]
+    inside = (log_r.exp() - r.flatten()).abs() <= errors
+    assert inside.float().mean(1).tolist() == pytest.approx([0.68, 0.95], abs=0.015)
+    drawn = replace(answers, calibration=found).calibrated().quantile(torch.full_like(r, 0.84))
+    held = (log_r <= drawn.flatten()).float().mean().item()
+    assert held == pytest.approx(0.84, abs=0.015)
+
+
+def test_factors_of_a_sensor_multiply_the_errors_of_its_scans(tmp_path):
+    images = scans(1)
+    flow = network()
+    jump = {"sampler": "jump", "steps": 1}
+    (plain,) = complete(flow, images, halved(images), **jump)
+    own = replace(flow.sensor, name="own", error_factors=(2.0, 3.0))
+    (other,) = complete(
+        flow.through(replace(own, error_factors=None)), images, halved(images), **jump
+    )
+    (scaled,) = complete(flow.through(own), images, halved(images), **jump)
+    expected = torch.tensor([2.0, 3.0])[:, None, None, None] * other.error(0.68, 0.95)
+    torch.testing.assert_close(scaled.error(0.68, 0.95), expected)
+    write_sensor(own, tmp_path / "own.yaml", "a comment")
+    assert read_sensor(tmp_path / "own.yaml").error_factors == (2.0, 3.0)
+    with pytest.raises(InputError, match="error_factors must be two positive numbers"):
+        replace(own, error_factors=(1.0,))
+    (kept,) = complete(flow, images, halved(images), max_error=1.0, **jump)
+    error = plain.error(0.68)[0]
+    assert 0 < (error > 1).sum() < (error > 0).sum()
+    assert torch.equal(kept.images[:, 0] > 0, (plain.images[:, 0] > 0) & (error <= 1))
+    with pytest.raises(InputError, match="predicts no errors"):
+        list(complete(network("rectified_flow"), images, halved(images), max_error=1.0))
+
+
+def test_errors_times_the_factors_that_were_found_hold_the_truth_of_these_scans(monkeypatch):
+    flow = network()
+    truths = [image.numpy() for image in scans(4)]
+    monkeypatch.setattr("r2flow.reports.calibration._FEWEST", 100)
+    own = flow.through(replace(flow.sensor, error_factors=(5.0, 5.0)))
+    found = trust_of(own, truths)
+    assert found == trust_of(flow, truths)  # old factors do not count
+    again = flow.through(replace(flow.sensor, error_factors=found.factors))
+    inside = []
+    for number, truth in enumerate(truths):
+        images = torch.from_numpy(truth)[None]
+        for task in TASKS:
+            kept = torch.from_numpy(kept_rays(task, flow.sensor, number))
+            state = ray_states(images, kept[None])
+            (one,) = complete(again, images * kept, state, sampler="jump", steps=1)
+            r = one.images[0, 0]
+            right = (r > 0) & (images[0, 0] > 0) & ~kept
+            error = (r - images[0, 0]).abs()
+            inside.append((error <= one.error(0.68, 0.95)[:, 0] * (1 + 1e-5))[:, right])
+    shares = torch.cat(inside, 1).float().mean(1)
+    assert shares.tolist() == pytest.approx([0.68, 0.95], abs=2 / found.points)

@@ -318,6 +318,14 @@ def complete(
         ),
     ] = None,
     num: Annotated[int, Option(min=1, help="Completions per scan.")] = 1,
+    max_error: Annotated[
+        float | None,
+        Option(
+            min=0.001,
+            metavar="METRES",
+            help="Keep added points whose true range is within it in 68 %. Default: all.",
+        ),
+    ] = None,
     seed: SeedOption = 0,
     batch_size: BatchOption = 1,
     pictures: Annotated[
@@ -364,7 +372,8 @@ def complete(
             channel in loaded.encoding.slices,
             f"the model has the channels {', '.join(loaded.encoding.slices)}, not {channel}.",
         )
-    job = replace(job, precision=precision or usual_precision(loaded.generator))
+    precision = precision or usual_precision(loaded.generator)
+    job = replace(job, precision=precision, max_error=max_error)
     sampler = completing(loaded.generator, several=num > 1, **how.given)
     for remark in remarks:
         print(remark)

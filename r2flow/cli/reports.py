@@ -5,6 +5,7 @@ compare`.
 import logging
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -340,3 +341,41 @@ def compare(
     print_comparison(groups, tex=format == "tex")
     if out is not None:
         print(*write_page(compare_page(groups), out), sep="\n")
+
+
+@app.command(rich_help_panel="Draw", epilog="Example: r2flow calibrate my/scans --sensor mine.yaml")
+def calibrate(
+    real: Annotated[str, Argument(help=f"A few whole scans: {SETS}.")],
+    sensor: Annotated[Path, Option(help="YAML file of their sensor: the factors go into it.")],
+    model: Annotated[
+        str, Option("--checkpoint", "-c", help="The model whose errors are compared.")
+    ] = "densify",
+    num: Annotated[int, Option(min=1, help="Maximum number of scans, evenly spread.")] = 16,
+    reflectance_scale: ScaleChoice = None,
+    device: DeviceOption = "auto",
+) -> None:
+    """Improve the errors of added points for your own sensor: rows of its scans are hidden, and
+    the factors that hold the truth are written into its file.
+    """
+    from r2flow.base.progress import Bar
+    from r2flow.lidar.sensors import read_sensor, write_sensor
+    from r2flow.model.checkpoint import load_checkpoint
+    from r2flow.model.inversion import real_scans
+    from r2flow.reports.calibration import TASKS, trust_of
+
+    own = read_sensor(sensor)
+    flow = load_checkpoint(model, choose_device(device)).through(own)
+    _, images = real_scans(flow, [real], reflectance_scale, num, need_reflectance=False)
+    with Bar("completing", len(images) * len(TASKS), "evaluations") as advance:
+        found = trust_of(flow, [*images.numpy()], advance)
+    lines = sensor.read_text(encoding="utf-8").splitlines()
+    said = [line for line in lines if line.startswith("#") and "error_factors" not in line]
+    about = f"error_factors: r2flow calibrate, {model}, {len(images)} scans"
+    comment = "\n".join(line.removeprefix("#").strip() for line in [*said[:-1], about])
+    write_sensor(replace(own, error_factors=found.factors), sensor, comment)
+    first, second = found.factors
+    print(
+        f"{found.points:,} added points: {found.shares[0]:.1%} within error_68, "
+        f"{found.shares[1]:.1%} within error_95; error_factors [{first:.3f}, {second:.3f}] in "
+        f"{sensor}"
+    )

@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from r2flow.generators.calibration import Calibration
 
 NEVER = -1e4  # logit of a missing candidate
 # Correlation length of drawn answers: best panel on scans of KITTI raw and object.
@@ -15,6 +17,7 @@ HIT = 0.1  # metres
 # Widths of an interval about a completed range, over its expected error, between which
 # probabilities are interpolated: on scans they are then wrong by 1 % in the mean.
 WIDTHS = (1 / 32, 1 / 8, 1 / 3, 1.0, 2.5)
+_WIDEST = 5.0  # largest width: nothing is known of such a ray
 _RAYS = 8192  # of a block: what is computed of them stays in a core's cache
 FAINT = 0.1  # reflectance of training, below which differences are as errors, not as ratios
 
@@ -30,6 +33,7 @@ class Answers:
     strengths: Tensor  # reflectance of each candidate, (B, 7, H, W)
     labels: Tensor  # log probability of each class, given a return, (B, K, H, W); K = 0 without
     faint: Tensor | float = FAINT  # `FAINT` in the scan's own units
+    calibration: Calibration | None = None  # of `error`, `p_return` and `calibrated`
 
     def among(self, rows: int, own: slice) -> "Answers":
         """These rows among `rows` rows, of which the others have no return."""
@@ -41,7 +45,15 @@ class Answers:
             for value in (self.ranges, self.scales, self.logits, self.strengths, self.labels)
         )
         returns = F.pad(self.returns, sides, value=NEVER)
-        return Answers(logits, ranges, scales, returns, strengths, labels, self.faint)
+        return replace(
+            self,
+            logits=logits,
+            ranges=ranges,
+            scales=scales,
+            returns=returns,
+            strengths=strengths,
+            labels=labels,
+        )
 
     def log_density(self, log_r: Tensor) -> Tensor:
         """log p(log r | return), (B, 1, H, W)."""
@@ -82,6 +94,36 @@ class Answers:
             high = torch.where(below, high, middle)
         return (low + high) / 2
 
+    @property
+    def p_return(self) -> Tensor:
+        """Probability of a return, calibrated, (B, 1, H, W); 1 or 0 for measured rays."""
+        if self.calibration is None:
+            return self.returns.sigmoid()
+        slope, offset = self.calibration.returns
+        return (slope * self.returns + offset).sigmoid()
+
+    def calibrated(self) -> "Answers":
+        """These answers with the calibrated density, for drawing: its last candidate is wide, and
+        has the reflectance of the likeliest one.
+        """
+        if self.calibration is None or self.calibration.spread is None:
+            return self
+        parts = (x.movedim(1, 0).flatten(1) for x in (self.logits, self.ranges, self.scales))
+        likely = self.logits.argmax(1, keepdim=True)
+        strengths = torch.cat([self.strengths, self.strengths.gather(1, likely)], 1)
+        shape = strengths.movedim(1, 0).shape
+        widened = (x.view(shape).movedim(0, 1) for x in self.calibration.widen(*parts))
+        logits, ranges, scales = widened
+        return replace(
+            self,
+            logits=logits,
+            ranges=ranges,
+            scales=scales,
+            strengths=strengths,
+            returns=self.p_return.logit(1e-6),
+            calibration=None,
+        )
+
     def error(self, r: Tensor, levels: Sequence[float]) -> Tensor:
         """Metres e with P(|x - r| <= e | return) = level for ranges r, (levels, B, H, W).
 
@@ -96,8 +138,12 @@ class Answers:
         for rays in asked.split(_RAYS):
             metres = r.flatten()[rays]
             logits, ranges, scales = (x.index_select(1, rays) for x in density)
+            if self.calibration is not None:
+                logits, ranges, scales = self.calibration.widen(logits, ranges, scales)
             widths = _widths(logits.exp(), (ranges - metres.log()).abs(), scales, wanted)
             errors[:, rays] = metres * widths
+        if self.calibration is not None:
+            errors *= errors.new_tensor([*map(self.calibration.factor, levels)])[:, None]
         return errors.view(len(levels), len(r), *r.shape[2:])
 
     def least_error(self) -> Tensor:
@@ -141,7 +187,8 @@ def _widths(p: Tensor, away: Tensor, scales: Tensor, wanted: Sequence[float]) ->
             slope = (x[k + 1] - x[k]) / (y[k + 1] - y[k]).clamp(min=0.05)
             at = x[k] + slope * (level - y[k])
             log_w = at if k == 0 else torch.where(y[k] <= level, at, log_w)
-        found.append(mean * log_w.exp())
+        most = math.exp(math.exp(level))  # 1 / (1 - P), by Markov's inequality
+        found.append((mean * log_w.exp().clamp(max=most)).clamp(max=_WIDEST))
     return torch.stack(found)
 
 

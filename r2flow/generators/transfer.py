@@ -27,6 +27,7 @@ from r2flow.generators.base import (
     autocast,
     holds,
 )
+from r2flow.generators.calibration import Calibration
 from r2flow.generators.flow import Conditioned, Flow
 from r2flow.generators.surroundings import (
     FEATURES,
@@ -115,6 +116,7 @@ class TransferFlow(Flow):
         self.numbered = True  # whether the vectors learned per row are used
         self.foreign = False  # whether the scans are of another sensor than the training scans
         self.density: Answers | None = None  # of the last step of one call
+        self.calibration: Calibration | None = None
 
     def start_from(self, parent: Generator) -> None:
         """Copy a transfer flow's weights; those of labels that it does not know begin at 0.
@@ -240,8 +242,8 @@ class TransferFlow(Flow):
         deviation of log r from the candidate that most likely produced it is multiplied by
         `residual`.
         """
-        answers = self._answered(torch.zeros((), device=x_0.device), x_0, condition)
-        self.density = answers
+        self.density = self._answered(torch.zeros((), device=x_0.device), x_0, condition)
+        answers = self.density.calibrated()
         e = (x_0 - condition["start"])[:, :1].float() / max(self.sigma, 1e-6)
         u = torch.special.ndtr(smoothed(e, condition[KNOWN][:, :1] < 1, self.elevations))
         p = answers.returns.sigmoid()
@@ -256,7 +258,16 @@ class TransferFlow(Flow):
     def _answered(self, t: Tensor, x: Tensor, condition: Condition) -> Answers:
         about = Surroundings(*(condition[name] for name in Surroundings._fields))
         how = (condition[name] for name in ("rows", "gain", "share"))
-        return self.answers(t, x.float(), about, *how)
+        answers = self.answers(t, x.float(), about, *how)
+        return replace(answers, calibration=self.calibration_of_sensor)
+
+    @property
+    def calibration_of_sensor(self) -> Calibration | None:
+        """The model's calibration with the factors of the scans' sensor."""
+        factors = self.space.sensor.error_factors
+        if factors is None:
+            return self.calibration
+        return replace(self.calibration or Calibration(), factors=factors)
 
     def _estimate(self, t: Tensor, x: Tensor, condition: Condition) -> Tensor:
         """The point estimate of x_1, computed where a ray is hidden and likely to return alone."""
@@ -270,8 +281,10 @@ class TransferFlow(Flow):
         likely = asked[:, :, near] & (answers.returns > 0)
         ray = likely.flatten().nonzero()[:, 0]
 
-        def rays(values: Tensor) -> Tensor:
+        def rays(values: Any) -> Any:
             """Those of the rays, (1, C, 1, N), of (B, C, H, W)."""
+            if not isinstance(values, Tensor):
+                return values
             every = values.expand(-1, -1, *likely.shape[2:]).movedim(1, 0).flatten(1)
             return every.index_select(1, ray)[None, :, None]
 

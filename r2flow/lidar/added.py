@@ -15,6 +15,7 @@ from r2flow.lidar.scan_files.cloud import as_type
 from r2flow.lidar.sensors import Sensor
 
 MEASURED = "measured"  # uint8: 1 for a point of the scan, 0 for an added one
+TRUST = ("error_68", "error_95", "p_return")  # float32, see `Completed.trust`
 ROW = "image_row"  # uint16: row of the answer's sensor from the top, of every point
 NO_ROW = 65535  # of a measured point outside the view of the answer's sensor
 
@@ -99,7 +100,7 @@ def unknown_fields(cloud: Cloud) -> list[str]:
     return [
         name
         for place, name in enumerate(names)
-        if place not in known and name not in (MEASURED, ROW)
+        if place not in known and name not in (MEASURED, ROW, *TRUST)
     ]
 
 

@@ -39,11 +39,15 @@ class Sensor:
     # Row of laser 0, 1, ... in the order of the sensor's packets; None: top-down or bottom-up.
     firing: tuple[int, ...] | None = None
     reflectance_scale: float | None = None  # value of full reflectance in its scan files
+    # Factors of the 68 % and the 95 % error of points added to its scans (`r2flow calibrate`).
+    error_factors: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "elevations", _plain(self.elevations))  # lists have no hash
         if self.firing is not None:
             object.__setattr__(self, "firing", _plain(self.firing))
+        if self.error_factors is not None:
+            object.__setattr__(self, "error_factors", _plain(self.error_factors))
         rows = len(self.elevations)
         order = range(rows) if self.firing is None else self.firing
         scale = 1.0 if self.reflectance_scale is None else self.reflectance_scale
@@ -59,15 +63,22 @@ class Sensor:
             "height must be metres above the ground": 0 < self.height < inf,
             "firing must name each row once": sorted(order) == list(range(rows)),
             "reflectance_scale must be a positive number": 0 < scale < inf,
+            "error_factors must be two positive numbers": (
+                self.error_factors is None
+                or (len(self.error_factors) == 2 and all(0 < x < inf for x in self.error_factors))
+            ),
         }
         for rule, holds in rules.items():
             if not holds:
                 raise InputError(f"sensor {quoted(self.name)}: {rule}.")
 
     def described(self) -> dict[str, Any]:
-        """All fields that images depend on, as plain values: all except `reflectance_scale`."""
+        """All fields that images depend on, as plain values: all except `reflectance_scale` and
+        `error_factors`.
+        """
         fields = asdict(self)
         del fields["reflectance_scale"]
+        del fields["error_factors"]
         return fields
 
     @property
@@ -212,6 +223,7 @@ def build_sensor(
     elevations: Sequence[float] | None = None,
     firing: Sequence[int] | None = None,
     reflectance_scale: float | None = None,
+    error_factors: Sequence[float] | None = None,
     rays: Rays = "centre",
 ) -> Sensor:
     """A built-in sensor by name, or a custom sensor by `elevations`, with the given options.
@@ -226,6 +238,8 @@ def build_sensor(
         sensor = Sensor(name, tuple(e + 0.0 for e in elevations))  # no -0.0
     if firing is not None:
         sensor = replace(sensor, firing=tuple(firing))
+    if error_factors is not None:
+        sensor = replace(sensor, error_factors=tuple(error_factors))
     limits = {
         "min_range": min_range,
         "max_range": max_range,

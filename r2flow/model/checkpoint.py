@@ -23,6 +23,7 @@ from r2flow.data.options import FOLDER as PLAIN
 from r2flow.data.options import SourceOptions
 from r2flow.data.partial import PartialScan, Sight, open_partial, sight
 from r2flow.generators import Generator, TransferFlow, build_generator
+from r2flow.generators.calibration import Calibration
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import Points, points_in_memory
 from r2flow.lidar.sensors import Sensor, named_sensor
@@ -328,7 +329,11 @@ def load_checkpoint(
         raise InputError(
             f"{path} is not what r2flow writes, or damaged ({type(error).__name__}: {error})."
         ) from error
-    return replace(checkpoint, generator=checkpoint.generator.to(device))
+    generator = checkpoint.generator.to(device)
+    beside = path.with_suffix(".calibration.yaml")
+    if isinstance(generator, TransferFlow) and beside.is_file():
+        generator.calibration = Calibration.read(beside)
+    return replace(checkpoint, generator=generator)
 
 
 def _of_torch(content: Any, path: Path, averaged: bool, backbone: nn.Module | None) -> Checkpoint:

@@ -87,8 +87,9 @@ class Completer:
             first=number,
             **self._how,
         )
+        image = completed.images[0].numpy()
         with naming(IN_MEMORY):
-            return completed_cloud(given, completed.images[0].numpy(), self.sensor)
+            return completed_cloud(given, image, self.sensor, completed.trust(0))
 
 
 def _of_array(array: ndarray, columns: Sequence[str] | None) -> Cloud:

@@ -4,10 +4,11 @@ network's rounding.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
+from numpy import ndarray
 from torch import Tensor
 
 from r2flow.base.devices import multiplies_bfloat16
@@ -44,15 +45,31 @@ class Completed(Samples):
         pairs = zip(self.densities, parts, strict=True)
         return torch.cat([one.error(part.to(one.returns), levels).cpu() for one, part in pairs], 1)
 
+    def trust(self, answer: int) -> dict[str, tuple[ndarray, float]]:
+        """Fields of the points of an answer: `error_68`, `error_95`, `p_return` of each ray, (H,
+        W), and of all measured points; none without a predicted density.
+        """
+        if not self.densities:
+            return {}
+        errors = self.error(0.68, 0.95)[:, answer].numpy()
+        p = self.p_return[answer].numpy()
+        return {"error_68": (errors[0], 0.0), "error_95": (errors[1], 0.0), "p_return": (p, 1.0)}
+
+    def within(self, metres: float) -> "Completed":
+        """These answers without added points whose 68 % error exceeds some metres."""
+        kept = ~(self.error(0.68)[0] > metres)
+        return replace(self, images=self.images * kept[:, None])
+
     @property
     def p_return(self) -> Tensor:
         """Probability that a ray returns, (A, H, W) float32: 1 and 0 for measured rays; NaN for
         hidden ones of a model that predicts no density.
         """
-        if not self.densities:
-            returned = (self.images[:, 0] > 0).float()
-            return torch.where(self.measured, returned, torch.nan)
-        return torch.cat([one.returns.sigmoid()[:, 0].cpu() for one in self.densities])
+        returned = (self.images[:, 0] > 0).float()
+        p = torch.full_like(returned, torch.nan)
+        if self.densities:
+            p = torch.cat([one.p_return[:, 0].cpu() for one in self.densities])
+        return torch.where(self.measured, returned, p)
 
     @property
     def spread(self) -> Tensor:
@@ -130,6 +147,7 @@ def complete(
     batch_size: int = 1,
     first: int = 0,
     precision: Precision | None = None,
+    max_error: float | None = None,
     progress: Progress = None,
     **changes: Any,
 ) -> Iterator[Completed]:
@@ -154,6 +172,7 @@ def complete(
         batch_size: Answers per batch. It does not change a fixed-step result beyond rounding.
         first: Number of the first scan.
         precision: Precision of the network; None: `usual_precision`.
+        max_error: Metres that the 68 % error of an added point may have; None: any.
         progress: Called after every network evaluation of a batch.
         changes: Fields of the sampler: steps, grid, ...
 
@@ -166,6 +185,11 @@ def complete(
     check(
         whole and min(num, batch_size) >= 1,
         f"give answers and a batch of at least 1; found {num!r}, {batch_size}.",
+    )
+    check(max_error is None or max_error > 0, f"max_error is metres above 0; found {max_error!r}.")
+    check(
+        max_error is None or isinstance(generator, TransferFlow),
+        f"a {type(generator).__name__} predicts no errors: leave max_error out, or give densify.",
     )
     if isinstance(sampler, Sampler):
         how = sampler.changed(**changes)
@@ -211,7 +235,7 @@ def complete(
         shared = min(returns, image.shape[0])
         answers[:, :shared] = torch.where(measured, image[:shared], answers[:, :shared])
         warn_unsolved(converged, of=f" of the answers to scan {first + i}")
-        yield Completed(
+        completed = Completed(
             answers * (answers[:, :1] > 0),
             first + i,
             evaluations,
@@ -220,6 +244,7 @@ def complete(
             measured=measured,
             densities=tuple(densities),
         )
+        yield completed if max_error is None else completed.within(max_error)
 
 
 def label(source: HasGenerator | Generator, images: Tensor, **how: Any) -> Tensor:

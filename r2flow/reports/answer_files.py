@@ -72,7 +72,7 @@ def write_answers(
     sensor = checkpoint.sensor
     silent = given.points.reflectance is None if given.points else len(given.image) == 1
     silent &= "reflectance" not in job.hide  # else that of the answer would be invented
-    for path, image in zip(files, completed.images.numpy(), strict=True):
+    for number, (path, image) in enumerate(zip(files, completed.images.numpy(), strict=True)):
         name = path.name.removesuffix(scan_ending(path.name) or path.suffix)
         if scan.image:
             if labelled:
@@ -80,7 +80,7 @@ def write_answers(
             save_array(path, image[: 1 if silent else 2])
             continue
         with naming(scan.path or scan.name):
-            cloud = completed_cloud(given, image, sensor)
+            cloud = completed_cloud(given, image, sensor, completed.trust(number))
         drawn = "reflectance" in job.hide and len(image) > 1
         if labelled or drawn:
             values = _of_points(given, image, sensor.rays())

@@ -3,16 +3,21 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from r2flow.data.partial import PartialScan
 from r2flow.lidar.known import Ray
+from r2flow.lidar.labels import semantic_ids
 from r2flow.lidar.other_sensors import Partial
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.completion import Completed
-from r2flow.reports.pictures import contact_sheet, save_figure
-from r2flow.reports.view import panel_of, write_viewer
+from r2flow.reports.pictures import contact_sheet, save_figure, trust_ids
+from r2flow.reports.view import Panel, write_viewer
 
 if TYPE_CHECKING:
     from r2flow.reports.answer_errors import Compared
+
+_MOST = 4  # answers of a picture
 
 
 def draw_answers(
@@ -23,13 +28,20 @@ def draw_answers(
     completed: Completed,
     compared: "Compared | None" = None,
 ) -> None:
-    """Write `NAME.png` and `NAME.html` with the known rays and up to four answers, and if a part
-    was hidden the best interpolation, the truth, and both errors.
+    """Write `NAME.png` and `NAME.html` with your scan and up to four answers, and if a part was
+    hidden the best interpolation, the truth, and both errors.
+
+    Points are coloured by their predicted error too, or by the labels of a labelled model. Without
+    reflectance in the scan, none is drawn.
     """
     rays = sensor.rays()
-    answers = completed.images.numpy()[:4]
+    answers = completed.images.numpy()[:_MOST]
+    several = len(answers) > 1
+    names = [
+        "your scan",
+        *(f"completed, answer {i}" if several else "completed" for i in range(len(answers))),
+    ]
     images = [given.image, *answers]
-    names = ["what is known", *(f"answer {number}" for number in range(len(answers)))]
     title = scan.name
     if compared:
         from r2flow.reports.answer_errors import in_words  # slow
@@ -37,7 +49,18 @@ def draw_answers(
         images += [compared.interpolation, compared.truth]
         names += [f"interpolation: {compared.errors.name}", "true"]
         title += f", {in_words([compared.errors])}"
-    panels = [panel_of(name, image[None], rays) for name, image in zip(names, images, strict=True)]
+    ids: list[np.ndarray | None] = [None] * len(images)
+    if answers.shape[1] > 2:
+        ids = [semantic_ids(image[2]) if len(image) > 2 else None for image in images]
+    elif completed.densities:
+        errors = completed.error(0.68)[0, : len(answers)].numpy()
+        for place, error in enumerate([np.zeros_like(errors[0]), *errors]):
+            ids[place] = trust_ids(images[place], error)
+    images = [image[: min(len(given.image), 2)] for image in images]
+    panels = [
+        Panel(name, image[None], rays, None if one is None else one[None])
+        for name, image, one in zip(names, images, ids, strict=True)
+    ]
     write_viewer(out / f"{scan.name}.html", panels, title)
-    figure = contact_sheet(images, rays, names, given.state == Ray.UNKNOWN)
+    figure = contact_sheet(images, rays, names, given.state == Ray.UNKNOWN, ids)
     save_figure(figure, out / f"{scan.name}.png")

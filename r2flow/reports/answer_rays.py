@@ -31,6 +31,7 @@ class Job:
     pictures: int = 8  # number of scans with a picture and a 3-D page
     precision: Precision = "32-true"
     label_ids: LabelList = SEMANTIC_KITTI  # of the labels of scans and answers
+    max_error: float | None = None  # metres that error_68 of an added point may have
 
 
 def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:

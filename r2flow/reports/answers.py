@@ -47,6 +47,7 @@ def write_completed(
         "fill_gaps": job.fill_gaps,
         **about,
         "precision": job.precision,
+        "max_error": job.max_error,
         "hide": sorted(job.hide) or None,
     }
     recipe = recipe_of(checkpoint, job.seed, sampler, job.label_ids, completion=settings)
@@ -75,6 +76,7 @@ def write_completed(
             batch_size=job.batch_size,
             first=number,
             precision=job.precision,
+            max_error=job.max_error,
             progress=bar.evaluated,
         )
         return given, completed

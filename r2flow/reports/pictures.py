@@ -33,6 +33,25 @@ _ROOM = 15.0  # metres of reach up to which the camera stands behind a room, fou
 _AXES = np.array([[0, 0.3090, 0.9511], [-1, 0, 0], [0, 0.9511, -0.3090]])
 
 
+# Ids, names and colours of points by the metres within which they are right in 68 %.
+_LIMITS = (0.05, 0.2, 1.0)
+TRUST = {
+    65000: ("measured", "#8d949e"),
+    65001: ("added, within 0.05 m", "#2f9e44"),
+    65002: ("within 0.2 m", "#fcc419"),
+    65003: ("within 1 m", "#f76707"),
+    65004: ("more", "#c92a2a"),
+}
+
+
+def trust_ids(image: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """The ids of `TRUST` of a scan, (C, H, W), with the 68 % error of each ray in metres, (H, W);
+    0 without a return.
+    """
+    ids = min(TRUST) + 1 + np.searchsorted(_LIMITS, error)
+    return np.where(error > 0, ids, min(TRUST)) * (image[0] > 0)
+
+
 class View(NamedTuple):
     """Metres that colours and views span."""
 
@@ -104,13 +123,17 @@ def contact_sheet(
     rays: Tensor,
     titles: Sequence[str] = (),
     unmeasured: np.ndarray | None = None,
+    labels: Sequence[np.ndarray | None] | None = None,
 ) -> Figure:
     """Draw several scans in their common view, one per row: range, reflectance and labels on the
     left, bird's-eye view and perspective on the right.
 
-    Rays of the first scan that were not measured, (H, W) bool, are grey.
+    Rays of the first scan that were not measured, (H, W) bool, are grey. `labels`: semantic ids or
+    those of `TRUST`, (H, W) each; default: those of a labelled model's images.
     """
-    labels = [image[2] if len(image) > 2 and image[2].any() else None for image in images]
+    if labels is None:
+        classes = [image[2] if len(image) > 2 and image[2].any() else None for image in images]
+        labels = [None if one is None else semantic_ids(one) for one in classes]
     images = [image[:2] for image in images]
     view = view_of(*((image, rays) for image in images))
     labelled = any(one is not None for one in labels)
@@ -135,8 +158,8 @@ def contact_sheet(
         xyz, _ = image_to_points(image, rays)
         _draw_birds_eye(figure.add_subplot(grid[row, 1]), xyz, view, label)
         _draw_perspective(figure.add_subplot(grid[row, 2]), xyz, view, label)
-        if (classes := labels[row]) is not None:
-            _draw_labels(figure.add_subplot(cells[-1]), semantic_ids(classes))
+        if (ids := labels[row]) is not None:
+            _draw_labels(figure.add_subplot(cells[-1]), ids)
         if label and unmeasured is not None:
             grey = np.where(unmeasured[..., None], (0.6, 0.6, 0.6, 1), 0)
             for axes in strips:
@@ -198,7 +221,7 @@ def _draw_labels(axes: Any, labels: np.ndarray) -> None:
         frameon=False,
         handlelength=1,
     )
-    _frame(axes, "label", True, "black")
+    _frame(axes, "error" if classes.keys() & TRUST.keys() else "label", True, "black")
 
 
 def class_colours(labels: np.ndarray, most: int) -> dict[int, tuple[str, str]]:
@@ -209,6 +232,8 @@ def class_colours(labels: np.ndarray, most: int) -> dict[int, tuple[str, str]]:
     """
     ids, counts = np.unique(labels, return_counts=True)
     ordered = ids[np.argsort(-counts)][:most].tolist()
+    if all(label in TRUST for label in ids.tolist()):
+        return {label: TRUST[label] for label in sorted(ordered)}
     if all(label in CLASSES for label in ids.tolist()):
         return {label: CLASSES[label] for label in ordered}
     hues = colormaps["hsv"]  # the golden ratio separates the hues of neighbouring ids

@@ -11,7 +11,9 @@ const MOST_TILES = 16; // on screen
 const SLOW = 90; // milliseconds per frame above which a moving camera draws fewer points
 const COARSE = 5; // draw every n-th point; not a divisor of usual numbers of columns, to avoid stripes
 
-const state = { mode: MODES[0], size: 0, frame: 0, first: 0, alone: null, picked: null, playing: false };
+const nameOf = (mode) => (mode === "label" ? page.kind : mode);
+
+const state = { mode: page.shown.label && page.kind === "label" ? "label" : MODES[0], size: 0, frame: 0, first: 0, alone: null, picked: null, playing: false };
 const camera = { target: [0, 0, 0], yaw: Math.PI, pitch: 0.42, distance: 30 };
 
 
@@ -699,7 +701,9 @@ addEventListener("keydown", (event) => {
 
 function setMode(mode) {
   state.mode = mode;
-  for (const button of element("modes").children) button.setAttribute("aria-pressed", button.textContent === mode);
+  for (const button of element("modes").children) {
+    button.setAttribute("aria-pressed", button.textContent === nameOf(mode));
+  }
   const legend = element("legend");
   legend.replaceChildren();
   const say = (text) => node("span", legend, { textContent: text });
@@ -720,11 +724,12 @@ function setMode(mode) {
       node("i", legend).style.background =
         `linear-gradient(90deg, ${part.map((i) => `rgb(${table.slice(i, i + 3).join(" ")})`)})`;
     };
-    say(`${mode} ${low}${unit}`);
+    const rounded = (value) => `${Number(value.toPrecision(2))}${unit}`;
+    say(`${mode} ${rounded(low)}`);
     bar(stops.slice(0, 9));
-    say(`${Math.round(10 * middle) / 10}${unit}`); // range is on a logarithmic scale, reflectance on that of its root
+    say(rounded(middle)); // range is on a logarithmic scale, reflectance on that of its root
     bar(stops.slice(8));
-    say(`${high}${unit}`);
+    say(rounded(high));
   }
   redraw();
 }
@@ -760,7 +765,7 @@ function setTheme(theme) {
 }
 
 function buildControls() {
-  for (const mode of MODES) node("button", element("modes"), { textContent: mode, onclick: () => setMode(mode) });
+  for (const mode of MODES) node("button", element("modes"), { textContent: nameOf(mode), onclick: () => setMode(mode) });
   element("size").oninput = (event) => setSize(Number(event.target.value));
   element("reset").onclick = reset;
   element("top").onclick = top;
