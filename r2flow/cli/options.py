@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from typer import Argument, Option
 
 if TYPE_CHECKING:
+    from r2flow.data.opening import Spec
     from r2flow.data.reading import Reading
     from r2flow.model.checkpoint import Checkpoint
 
@@ -167,7 +168,7 @@ class ReadingOptions:
 
     def reading(
         self,
-        specs: Sequence[str | None],
+        specs: "Sequence[Spec | None]",
         model: "Checkpoint | None" = None,
         estimate: bool = False,
     ) -> "Reading":
