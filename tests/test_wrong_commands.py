@@ -50,7 +50,7 @@ sample run -o out --grid power:10 --steps 64 # 64 steps on power:10
 sample '' -o out # an argument is empty
 sample run -o out --steps 10000000 # 1,000,000
 export flow.safetensors --to safetensors --out ./flow.safetensors # replaced
-export run --from vlp16 # --from and --size are for models that complete
+export run --from vlp16 # --from, --sensor and --size are for models that complete
 export densify # name the sensor of the scans: --from vlp16
 export densify --from vlp16 --steps 2 # exported whole, as one jump
 export run --to onx # 'onx' is not one of 'onnx', 'pt2', 'safetensors'
