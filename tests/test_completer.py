@@ -15,6 +15,7 @@ KINDS = [
     ("ambient", "f4"), ("flags", "i2"),
 ]  # fmt: skip
 START = 17 * 10**17
+ADDED = ("measured", "image_row", "error_68", "error_95", "p_return")
 OWN = [name for name, _ in KINDS]
 
 
@@ -49,7 +50,7 @@ def test_measured_points_come_first_with_every_bit(completed):
     """Rays lost as NaN are no points."""
     rows = room()
     kept = rows[np.isfinite(rows["x"])]
-    assert completed.dtype.names == (*OWN, "measured", "image_row")
+    assert completed.dtype.names == (*OWN, *ADDED)
     for name in OWN:
         assert completed[name][: len(kept)].tobytes() == kept[name].tobytes(), name
     assert np.array_equal(completed["measured"], np.arange(len(completed)) < len(kept))
@@ -93,7 +94,7 @@ def test_rows_and_grids_are_completed_too(flow, completed):
     plain = completer(
         np.stack([rows[name].astype("f4") for name in ("x", "y", "z", "intensity")], 1)
     )
-    assert plain.dtype.names == ("x", "y", "z", "reflectance", "measured", "image_row")
+    assert plain.dtype.names == ("x", "y", "z", "reflectance", *ADDED)
     assert np.array_equal(plain["z"], completed["z"])
     assert completer.sensor == flow.sensor
     assert isinstance(completer(Cloud.of(rows)), Cloud)

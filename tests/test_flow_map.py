@@ -182,6 +182,7 @@ def stage(data: str = "pairs", **options) -> LearnFlowMap:
     found = LearnFlowMap(**{"generator": flow_map(), **options})
     found._trainer = SimpleNamespace(
         datamodule=data_of(data),
+        callbacks=[],
         accumulate_grad_batches=1,
         global_step=30,
         estimated_stepping_batches=60,

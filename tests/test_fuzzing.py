@@ -92,7 +92,7 @@ def write_stores(folder: Path, beside: Path) -> None:
     keep(folder, "pairs", *(file for file in (beside / "pairs").iterdir() if file.is_file()))
     write_points(beside / "scan.bin", XYZ, REFLECTANCE)
     (folder / "labels").mkdir()
-    DRAW.integers(0, 100, 64).astype("<u4").tofile(folder / "labels" / "scan.label")
+    DRAW.choice([0, 10, 40, 50, 70, 252], 64).astype("<u4").tofile(folder / "labels" / "scan.label")
     (folder / "image").mkdir()
     np.save(folder / "image" / "image.npy", DRAW.uniform(2, 70, (2, 8, 64)).astype(np.float32))
     Store(beside / "samples", "samples", {"reading": Reading(SENSOR).described()}).begin()

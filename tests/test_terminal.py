@@ -66,7 +66,7 @@ def test_a_lost_device_is_one_line(
     run = SimpleNamespace(
         trainer=trainer,
         folder=tmp_path,
-        config={"stage": {}},
+        config=SimpleNamespace(plain=lambda: {"stage": {}}),
         data=Mock(),
         stage=make_stage(CONFIG),
     )

@@ -75,7 +75,7 @@ def run(arguments: Sequence[str], command: Sequence[str]) -> int:
         message = explain_mistake(error)
     except (ImportError, MemoryError, RuntimeError, TypeError) as error:
         text = str(error) or "out of memory"
-        if isinstance(error, MemoryError):  # of a library in C++: std::bad_alloc
+        if isinstance(error, MemoryError) and str(error):  # of a library in C++: std::bad_alloc
             text = f"out of memory ({text})"
         cures = [cure for words, cure in _CURES.items() if re.search(words, text)]
         if not cures:

@@ -161,7 +161,8 @@ def check_intensities(plan: DataPlan) -> None:
     """
     for scans in filter(None, (*plan.sets, plan.held_out, plan.scans)):
         reading = scans.options.reading
-        if isinstance(scans.kind, Layout) and reading and reading.on_bad_scan != "skip":
+        checked = isinstance(scans.kind, Layout) and scans.options.folder.is_dir()
+        if checked and reading and reading.on_bad_scan != "skip":
             for points in readable(scans.paths[:1], reading.columns):
                 if points.reflectance is not None:
                     scaled_reflectance(scans.paths[0], points, reading.reflectance_scale)

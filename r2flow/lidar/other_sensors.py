@@ -112,7 +112,8 @@ def points_through(
         reflectance = reflectance[chosen]
     seen = _cast(target, xyz[chosen], pixel, empty, reflectance)
     assert seen.place is not None
-    place = np.where(seen.place < 0, -1, chosen[seen.place])
+    # Without a point in view there is no number to look up.
+    place = np.where(seen.place < 0, -1, chosen[seen.place]) if len(chosen) else seen.place
     rows = np.where(beam >= 0, row[beam], rows_of(elevation, target))
     return replace(seen, row=rows, place=place)
 

@@ -102,7 +102,7 @@ def test_the_view_shows_measured_and_added_points(folder, page):
     frame.wait_for_selector("html[data-ready]", state="attached", timeout=60_000)
     captions = [one.inner_text() for one in frame.query_selector_all("figcaption span")]
     assert captions == ["your scan", "completed"]
-    frame.click("text=label")
+    frame.click("text=origin")
     assert "measured" in frame.inner_text("#legend")
     points = np.fromfile(folder / "example.bin", np.float32).reshape(-1, 4)
     _, measured = expected(folder, points)

@@ -558,7 +558,7 @@ def test_a_published_recipe_is_built(name: str, tmp_path: Path):
         options.append("encoding.reflectance=true")  # or the scans decide it
     config = check(compose([f"experiment={name}", *options]))
     with torch.device("meta"):
-        assert sum(p.numel() for p in build_generator({**config}).parameters()) == FULL[name]
+        assert sum(p.numel() for p in build_generator(config.plain()).parameters()) == FULL[name]
 
 
 def test_the_published_recipe_with_positions_starts_from_its_autoencoder(tmp_path: Path):
@@ -570,13 +570,10 @@ def test_the_published_recipe_with_positions_starts_from_its_autoencoder(tmp_pat
         compose(["experiment=lidm_ape", *common]), parent=Parent(compose(first), tmp_path)
     )
     # the paper's
-    assert [config["data"][key] for key in ("name", "split", "drives")] == [
-        "kitti_360",
-        "train",
-        None,
-    ]
+    data = config.data
+    assert (data.name, data.split, data.drives) == ("kitti_360", "train", None)
     with torch.device("meta"):
         assert (
-            sum(p.numel() for p in build_generator(config).parameters())
+            sum(p.numel() for p in build_generator(config.plain()).parameters())
             == 15_070_361 + 257_751_560 + 524_288
         )

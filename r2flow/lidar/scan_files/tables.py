@@ -54,7 +54,8 @@ def read_rows(path: Path, columns: Sequence[str] | None) -> Cloud:
                 f"{','.join(names)} (_ for what is not used)."
             )
         for kind in ("float64", "float16") if not fitting else ():
-            others = fitting_widths(np.fromfile(path, kind))
+            with np.errstate(invalid="ignore", over="ignore"):  # of numbers that are none
+                others = fitting_widths(np.fromfile(path, kind))
             if others:
                 raise InputError(
                     f"it is made of rows of {others[0]} {kind}, not float32: convert it, as "

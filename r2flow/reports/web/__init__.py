@@ -97,6 +97,7 @@ def _write_page(folder: Path, models: Sequence[dict[str, Any]]) -> None:
         "colours": colour_table(),
         "classes": [("no return", "#808080"), *_CLASSES],
         "legend": _CLASSES,
+        "kind": "origin",
     }
     write_file(folder / "models.json", json.dumps({"models": models, "view": view}))
 

@@ -176,7 +176,7 @@ def _notes(path: Path) -> Options:
     """Read the published `config.yaml` next to a file; empty if missing."""
     file = path.with_name("config.yaml")
     with reading_errors(file):
-        content = parse_yaml(file.read_text()) if file.is_file() else {}
+        content = parse_yaml(file.read_text(), most_aliases=8) if file.is_file() else {}
     return content if isinstance(content, Mapping) else {}
 
 
