@@ -32,7 +32,8 @@ def are_metres(values: ndarray, width: int) -> bool:
     another size have random exponents.
     """
     xyz = values[: len(values) // width * width].reshape(-1, width)[:, :3]
-    size = abs(xyz.astype(float)).max(axis=1)
+    with np.errstate(invalid="ignore"):  # a NaN that signals
+        size = abs(xyz.astype(float)).max(axis=1)
     returned = size[size != 0]
     return bool(np.mean((returned > NEAREST) & (returned < FARTHEST)) > 0.95)
 
