@@ -396,9 +396,8 @@ with open(f"{sys.argv[2]}/{trainer.global_rank}.json", "w") as file:
 """
 
 
-@pytest.mark.parametrize(
-    ("devices", "scenes"), [(2, 20), pytest.param(4, 12, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("devices", "scenes"), [(2, 20), (4, 12)])
 def test_processes_measure_as_one(tmp_path: Path, devices: int, scenes: int):
     held_out = scenes // 4  # 5 by two, 3 by four
     (tmp_path / "script.py").write_text(PROCESSES)
