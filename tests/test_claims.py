@@ -71,8 +71,11 @@ def test_files_of_killed_writers_go_and_those_of_living_stay(tmp_path: Path):
     finally:
         living.kill()
         living.wait()
+    others = {".download.part", ".notes.lock", ".scan.1234.part", "plain.0123abcd.part"}
+    for name in others:
+        (tmp_path / name).touch()
     clear_leftovers(tmp_path)
-    assert os.listdir(tmp_path) == ["manifest.json"]
+    assert {*os.listdir(tmp_path)} == {"manifest.json", *others}
     with atomic_write(tmp_path / "scan.bin") as file:
         clear_leftovers(tmp_path)  # of another command
         file.write(b"whole")

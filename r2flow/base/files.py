@@ -4,6 +4,7 @@ import errno
 import fcntl
 import json
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -14,6 +15,9 @@ import numpy as np
 import yaml
 
 from r2flow.base.errors import InputError, check, naming
+
+# Names of `atomic_write`'s temporary files and of `Store`'s locks.
+_LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.part|\..+-\d{6}\.lock", re.DOTALL)
 
 
 @contextmanager
@@ -30,10 +34,10 @@ def atomic_write(path: str | Path) -> Iterator[IO[bytes]]:
         raise InputError(f"{path} is {kind}; name a file to write to.")
     path.parent.mkdir(parents=True, exist_ok=True)
     target = Path(os.path.realpath(path))
-    temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.part"
+    temporary = None
     try:
-        with open(temporary, "xb") as file:
-            locked(file.fileno(), fcntl.LOCK_SH)
+        temporary, opened = _temporary(target)
+        with opened as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -52,8 +56,20 @@ def atomic_write(path: str | Path) -> Iterator[IO[bytes]]:
             error.filename = str(path)
         raise error
     finally:
-        with suppress(OSError):
-            temporary.unlink()
+        if temporary is not None:
+            with suppress(OSError):
+                temporary.unlink()
+
+
+def _temporary(target: Path) -> tuple[Path, IO[bytes]]:
+    """A new file beside a target, open and locked."""
+    while True:
+        path = target.parent / f".{target.name}.{secrets.token_hex(4)}.part"
+        file = open(path, "xb")  # noqa: SIM115, the caller closes it
+        locked(file.fileno(), fcntl.LOCK_SH)
+        if os.fstat(file.fileno()).st_nlink:  # not cleared by another process before the lock
+            return path, file
+        file.close()
 
 
 def locked(descriptor: int, kind: int) -> bool:
@@ -70,8 +86,12 @@ def locked(descriptor: int, kind: int) -> bool:
 
 
 def clear_leftovers(folder: Path) -> None:
-    """Remove temporary files and locks of killed processes from a folder."""
-    for leftover in (*folder.glob(".*.part"), *folder.glob(".*.lock")):
+    """Remove temporary files of `atomic_write` and locks of `Store` that killed processes left in a
+    folder; hidden files of others stay.
+    """
+    for leftover in folder.glob(".*"):
+        if not _LEFTOVER.fullmatch(leftover.name):
+            continue
         with suppress(OSError), open(leftover, "rb") as file:
             if locked(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB):
                 leftover.unlink()

@@ -12,7 +12,7 @@ import yaml
 from torch import Tensor
 
 from r2flow.base.errors import check
-from r2flow.base.files import reading, write_file
+from r2flow.base.files import parse_yaml, reading, write_file
 
 FEATURES = 3  # 1, log of the spread, log r
 _NEAR = 1e-3  # spread in log r at which the features end, and 1
@@ -63,7 +63,7 @@ class Calibration:
     def read(cls, path: Path) -> Self:
         """Read a YAML file with `spread` and `returns`."""
         with reading(path, 1 << 16, "calibration's YAML"):
-            values: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+            values: Any = parse_yaml(path.read_text(encoding="utf-8"))
             spread = tuple(tuple(map(float, row)) for row in values["spread"])
             sizes = [len(row) for row in spread]
             check(sizes == [FEATURES] * len(_FIRST), f"{path}: spread is (5, 3), found {sizes}.")

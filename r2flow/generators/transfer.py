@@ -318,7 +318,7 @@ class TransferFlow(Flow):
         inputs = self._inputs(about.start + (kept < 1) * noise, about, condition["rows"])
         output = self.backbone(torch.zeros((), device=noise.device), inputs).float()
         metres = self.space.decode(image)
-        heard = known[:, 1][:, None] > 0  # OpenVINO refuses a second slice of a slice
+        heard = known[:, 1][:, None] > 0  # not a slice: OpenVINO 2026.4 refuses the exported graph
         compared = hidden & heard & (metres[:, :1] > 0)
         error = metres[:, 1:2] - self._read(output, about, gain, 0.0).strength()
         correction = output[:, _STRENGTH] / gain
