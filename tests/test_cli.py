@@ -144,6 +144,7 @@ def test_every_verb_has_help_with_an_example(r2flow, verb, monkeypatch):
     ("error", "words"),
     [
         (MemoryError(), "out of memory. Give smaller batches"),
+        (MemoryError("std::bad_alloc"), "out of memory (std::bad_alloc). Give smaller batches"),
         (
             ImportError("libtorch_cpu.so: failed to map segment from shared object"),
             "object. Give smaller batches",
@@ -175,6 +176,7 @@ def test_every_verb_has_help_with_an_example(r2flow, verb, monkeypatch):
 def test_what_a_machine_cannot_do_is_one_line(r2flow, monkeypatch, tmp_path, error, words):
     monkeypatch.setattr("r2flow.model.checkpoint.load_checkpoint", Mock(side_effect=error))
     assert words in r2flow("sample", "-o", tmp_path).refusal
+    assert words in r2flow("interpolate", "a", "b", "c", "-o", tmp_path).refusal
 
 
 def test_another_error_of_torch_keeps_its_traceback(r2flow, monkeypatch, tmp_path):

@@ -255,7 +255,7 @@ def test_a_diffusion_completes_by_its_own_repaint(complete, tmp_path):
             [],
             "must be a range image of floats (2 or 1, H, W), found float32 (1, 8",
         ),
-        (-scans()[0].numpy(), [], "0 stands for no return"),
+        (-scans()[0].numpy(), [], "Are these millimetres, or a scan in model space?"),
         (np.full((2, 8, 64), 3, np.float32), [], "its reflectance goes up to 3, not 1; divide"),
         (np.full((1, 8, 64), 90, np.float32), [], "none of its ranges lies within 1.45-80 m"),
     ],
@@ -263,6 +263,20 @@ def test_a_diffusion_completes_by_its_own_repaint(complete, tmp_path):
 def test_what_cannot_be_done_is_one_line(complete, tmp_path, image, options, message):
     np.save(tmp_path / "one.npy", scans()[0].numpy() if image is None else image)
     assert_refused(complete(tmp_path / "one.npy", *options), message, tmp_path / "out")
+
+
+def test_minus_one_is_no_return_at_any_share(complete, tmp_path):
+    image = full_scan(tmp_path / "zeros.npy")
+    image[:, ::4] = 0
+    image[:, :, ::3] = 0
+    np.save(tmp_path / "zeros.npy", image)
+    np.save(tmp_path / "ones.npy", np.where(image[0] == 0, -1, image))
+    assert np.mean(image[0] == 0) > 0.5
+    options = "--steps", 2, "--mask", "rows:2"
+    for name in ("zeros", "ones"):
+        assert complete(tmp_path / f"{name}.npy", *options, out=tmp_path / name).said
+    completed = [np.load(tmp_path / name / f"{name}.npy") for name in ("zeros", "ones")]
+    np.testing.assert_array_equal(*completed)
 
 
 @pytest.mark.parametrize("sensor", [[], ["--from", "vlp32c"]])

@@ -1,5 +1,6 @@
 """Names of files that are no plain words, and a disk that is full."""
 
+import io
 import os
 import shutil
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from r2flow.base.errors import InputError, explain_mistake
+from r2flow.base.errors import Harmless, InputError, explain_mistake
 from r2flow.base.files import atomic_write
 from r2flow.reports.pages import blank_figure
 from r2flow.reports.pictures import figure_pixels
@@ -101,3 +102,11 @@ def test_a_newline_in_a_name_does_not_eat_the_line():
     of_a_worker = "Caught InputError in DataLoader worker process 0.\nOriginal Traceback (most recent call last):\n"
     of_a_worker += '  File "x", line 1\nr2flow.base.errors.InputError: a\nb.bin is empty.\n'
     assert explain_mistake(InputError(of_a_worker)) == r"a\nb.bin is empty."
+
+
+def test_names_in_results_do_not_control_the_terminal():
+    raw = io.BytesIO()
+    stream = Harmless(raw, "utf-8", line_buffering=True)
+    stream.write("a\033]0;title\007b\033[2Jc\x9b5nd\033[1mbold\033[0m ä\t\n")
+    plain = r"a\x1b]0;title\x07b\x1b[2Jc\x9b5nd" + "\033[1mbold\033[0m ä\t\n"
+    assert raw.getvalue().decode() == plain

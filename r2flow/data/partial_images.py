@@ -50,18 +50,19 @@ def read_partial(
     found = f"found {stored.dtype} {stored.shape}"
     other = f"{path} must be a range image of floats (2 or 1, H, W), {found}."
     check(stored.dtype.kind == "f" and len(stored) in (1, 2) and stored.size, other)
-    wrong = wrong_with(torch.from_numpy(stored.astype(np.float32)), max(FAR, target.max_range))
+    image = read_range_image(path)
+    if image is None:  # empty, or points (1, N, 4)
+        raise InputError(other)
+    known = np.where(np.isfinite(stored), image, stored).astype(np.float32)
+    wrong = wrong_with(torch.from_numpy(known), max(FAR, target.max_range))
     check(not wrong, f"{path}: {wrong}; --mask FILE.npy names what was not measured.")
-    r = stored[0]
+    r = image[0]
     within = not r.any() or ((r >= target.min_range) & (r <= target.max_range)).any()
     check(
         within,
         f"{path}: none of its ranges lies within {target.min_range:g}-{target.max_range:g} m. Are "
         "they in m?",
     )
-    image = read_range_image(path)
-    if image is None:  # empty, or points (1, N, 4)
-        raise InputError(other)
     if source is not None and image.shape[1] == source.shape[0]:
         return image_through(image, source.resized(columns=image.shape[2]), target)
     if source is not None or image.shape[1:] != target.shape:

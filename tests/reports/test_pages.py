@@ -67,6 +67,18 @@ def test_every_file_holds_the_rows_in_its_own_way(tmp_path):
         assert words in text
 
 
+def test_names_are_no_html_in_markdown_but_a_command_is_whole(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["/bin/r2flow", "report", "<b>"])
+    rows = [{"solver": "<script>alert(1)</script>"}]
+    hostile = page(title="<img src=x>", text=[table(rows, {"solver": "<i>"})])
+    write_page(hostile, tmp_path)
+    before, command_line, after = (tmp_path / "speed.md").read_text().split("```")
+    assert "<" not in before + after
+    assert "&lt;script>" in before
+    assert "&lt;img" in before
+    assert "'<b>'" in command_line
+
+
 def test_a_page_that_fails_leaves_the_old_one(tmp_path):
     write_page(page(), tmp_path)
     before = {
