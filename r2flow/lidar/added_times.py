@@ -1,28 +1,15 @@
 """The time at which a spinning LiDAR would have measured a ray, from those of measured points."""
 
 from math import pi
-from typing import NamedTuple
 
 import numpy as np
 from numpy import ndarray
 
 from r2flow.base.errors import InputError
 
-FEWEST = 8  # points of a row whose times are used
-APART = 10  # degrees between points from which the rate of turning is found
+TURN = 2 * pi
 CYCLE = 4  # rows after which an Ouster's beams look the same way again
-LEAST_STEP = np.radians(0.5)  # by which they look further in each
-MOST_ODD = 0.1  # share of such points whose times may contradict the turning
-
-
-class _Turning(NamedTuple):
-    """Measured points of a scan, sorted by row and azimuth."""
-
-    key: ndarray  # 2 pi row + azimuth, ascending
-    azimuth: ndarray  # in [0, 2 pi)
-    time: ndarray  # since the first point
-    start: ndarray  # of each row the place of its first point, (H + 1,)
-    rate: float  # time per radian, negative for a clockwise turn
+MOST_ODD = 0.1  # share of points whose times may contradict the turning, by an eighth of a turn
 
 
 def times_of(
@@ -35,11 +22,9 @@ def times_of(
 ) -> ndarray:
     """The times of rays, (K,), in the type, unit and zero of the measured times.
 
-    In a row with measured points, a ray's time is interpolated in azimuth between its neighbours;
-    at the turn's start, where they are a turn apart, it continues the nearer one's at the rate of
-    turning. In a row without, it is the mean of those in the measured rows above and below, by
-    their distance; of an Ouster, at the azimuths at which they fire with it (`_ahead`). No time is
-    outside the sweep.
+    A row looks some angle ahead of the sensor's head (`_ahead`). A ray's time is that of the
+    measured point nearest by the angle of the head, in its row or else in the nearest measured
+    one, plus the turn between them over the speed. No time is outside the sweep.
 
     Args:
         time: Times of the measured points, (N,), of any unit: absolute or relative, integer or not.
@@ -52,113 +37,86 @@ def times_of(
     Raises:
         InputError: The times are constant, do not follow the azimuth, or are no numbers.
     """
+    cure = f" Give --columns {name}=_, and it is kept for measured points alone."
     if time.dtype.kind not in "iuf" or time.ndim != 1:
-        raise InputError(f"its field {name} is {time.dtype}, no time a point.{_cure(name)}")
-    kind = time.dtype
-    usable = np.isfinite(time) if kind.kind == "f" else np.ones(len(time), bool)
+        raise InputError(f"its field {name} is {time.dtype}, no time a point.{cure}")
+    usable = np.isfinite(time)
     if not usable.any():
-        raise InputError(f"its field {name} has no finite time.{_cure(name)}")
-    native = time.astype(kind.newbyteorder("="))
+        raise InputError(f"its field {name} has no finite time.{cure}")
+    native = time.astype(time.dtype.newbyteorder("="))
     first = native[usable].min()
-    since = np.where(usable, native - first, 0).astype(float)  # exact in integers
-    last = since.max()
-    if last == 0:
-        raise InputError(f"its field {name} is {first} for every point.{_cure(name)}")
-    turning = _turning(since, row, azimuth, usable & (row >= 0), name)
-    found = np.clip(_in_turn(turning, asked_row, asked_azimuth), 0, last)
-    if kind.kind == "f":
-        return np.minimum(float(first) + found, float(native[usable].max())).astype(kind)
-    return (first + np.rint(found).astype(native.dtype)).astype(kind)
-
-
-def _cure(name: str) -> str:
-    return f" Give --columns {name}=_, and it is kept for measured points alone."
-
-
-def _turning(time: ndarray, row: ndarray, azimuth: ndarray, usable: ndarray, name: str) -> _Turning:
-    azimuth = azimuth % (2 * pi)
-    count = np.bincount(row[usable], minlength=1)
-    usable = usable & (count[row.clip(0, len(count) - 1)] >= FEWEST)
-    chosen = np.flatnonzero(usable)
-    key = 2 * pi * row[chosen] + azimuth[chosen]
-    order = chosen[np.argsort(key, kind="stable")]
-    start = np.searchsorted(row[order], np.arange(len(count) + 1))
-    turn, clock = azimuth[order], time[order]
-    step = max(1, round(len(order) / max((count >= FEWEST).sum(), 1) * APART / 360))
-    turned = turn[step:] - turn[:-step]
-    passed = clock[step:] - clock[:-step]
-    within = (row[order][step:] == row[order][:-step]) & (turned > 1e-4)
-    if not within.any():
-        raise InputError(f"its field {name} has too few times a row.{_cure(name)}")
-    rate = float(np.median(passed[within] / turned[within]))
-    whole = 2 * pi * abs(rate)
-    odd = passed[within] - rate * turned[within]
-    odd -= whole * np.rint(odd / whole) if whole else 0
-    if not whole or np.mean(abs(odd) > whole / 8) > MOST_ODD:
+    last = native[usable].max()
+    if first == last:
+        raise InputError(f"its field {name} is {first} for every point.{cure}")
+    usable &= row >= 0
+    since = (native[usable] - first).astype(float)  # exact in integers
+    row = row[usable]
+    azimuth = azimuth[usable]
+    rate = _rate(since, row, azimuth)
+    if not rate:
+        raise InputError(f"its field {name} has too few times a row.{cure}")
+    rows = max(row.max(initial=0), asked_row.max(initial=0)) + 1
+    head = since / rate
+    ahead = _ahead(azimuth - head, row, rows)
+    angle = azimuth - ahead[row]
+    if np.mean(np.cos(angle - head) < np.cos(pi / 4)) > MOST_ODD:
         raise InputError(
             f"its field {name} does not follow the azimuth in its rows: times run backwards or "
-            f"jump.{_cure(name)}"
+            f"jump.{cure}"
         )
-    return _Turning(2 * pi * row[order] + turn, turn, clock, start, rate)
+    asked = asked_azimuth - ahead[asked_row]
+    near = _nearest(row, angle, asked_row, asked)
+    turned = (asked - angle[near] + pi) % TURN - pi
+    found = (since[near] + rate * turned).clip(0, last - first)
+    if time.dtype.kind == "f":
+        return np.minimum(float(first) + found, float(last)).astype(time.dtype)
+    return (first + np.rint(found).astype(native.dtype)).astype(time.dtype)
 
 
-def _in_turn(turning: _Turning, row: ndarray, azimuth: ndarray) -> ndarray:
-    """Times of rays, (K,), before they are limited to the sweep."""
-    filled = np.flatnonzero(np.diff(turning.start))
-    after = np.searchsorted(filled, row)
-    above = filled[(after - 1).clip(0)]
-    below = filled[after.clip(max=len(filled) - 1)]
-    above = np.where(below <= row, below, above)  # a measured row is both
-    ahead = _ahead(turning, max(int(row.max(initial=0)) + 1, len(turning.start)))
-    upper = _in_row(turning, above, azimuth + ahead[row] - ahead[above])
-    other = _in_row(turning, below, azimuth + ahead[row] - ahead[below])
-    lower = np.where(below == above, upper, other)
-    up, down = abs(row - above), abs(below - row)
-    return _between(upper, lower, up, down, 2 * pi * abs(turning.rate))
-
-
-def _ahead(turning: _Turning, rows: int) -> ndarray:
-    """How far each row looks ahead of the sensor's azimuth in radians, (H,), if rows are those of
-    an Ouster: each looks further than the one above, and every `CYCLE`-th as the first. Else 0.
-
-    So rows without measured points, between others, are known too.
+def _rate(time: ndarray, row: ndarray, azimuth: ndarray) -> float:
+    """Time per radian, negative for a clockwise turn: the median of points a sixth of a row apart;
+    0 without such points.
     """
-    filled = np.flatnonzero(np.diff(turning.start) >= FEWEST)
-    place = np.repeat(np.arange(len(turning.start) - 1), np.diff(turning.start))
-    look = np.exp(1j * (turning.time / turning.rate - turning.azimuth))
-    of_row = np.bincount(place, look.real) + 1j * np.bincount(place, look.imag)
-    looks = np.angle(of_row[filled] / of_row[filled].sum())
-    phase = filled % CYCLE
-    if len(set(phase)) < 2:
-        return np.zeros(rows)
-    step, first = np.polyfit(phase, looks, 1)
-    off = abs(looks - first - step * phase)
-    if abs(step) < LEAST_STEP or np.median(off) > abs(step) / 10:
-        return np.zeros(rows)
-    return step * (np.arange(rows) % CYCLE)
+    azimuth = azimuth % TURN
+    order = np.lexsort((azimuth, row))
+    step = len(row) // (6 * max(len(np.unique(row)), 1)) + 1
+    turned = azimuth[order][step:] - azimuth[order][:-step]
+    passed = time[order][step:] - time[order][:-step]
+    within = (row[order][step:] == row[order][:-step]) & (turned > 1e-4)
+    return float(np.median(passed[within] / turned[within])) if within.any() else 0.0
 
 
-def _in_row(turning: _Turning, row: ndarray, azimuth: ndarray) -> ndarray:
-    azimuth = azimuth % (2 * pi)
-    first, end = turning.start[row], turning.start[row + 1]
-    place = np.searchsorted(turning.key, 2 * pi * row + azimuth).clip(first, end)
-    right = np.where(place == end, first, place)
-    left = np.where(place == first, end, place) - 1
-    before = (azimuth - turning.azimuth[left]) % (2 * pi)
-    after = (turning.azimuth[right] - azimuth) % (2 * pi)
-    rate = turning.rate
-    return _between(
-        turning.time[left] + rate * before,
-        turning.time[right] - rate * after,
-        before,
-        after,
-        2 * pi * abs(rate),
-    )
+def _ahead(angle: ndarray, row: ndarray, rows: int) -> ndarray:
+    """How far each row looks ahead of the head in radians, (H,), by the mean of its points.
+
+    That of a row without points lies between those of its neighbours; of an Ouster, each of
+    `CYCLE` rows looks further than the one before it, by equal steps.
+    """
+    known, place = np.unique(row, return_inverse=True)
+    look = np.exp(1j * angle)
+    mean = look.sum()
+    turned = look / mean
+    ahead = np.angle(np.bincount(place, turned.real) + 1j * np.bincount(place, turned.imag))
+    phase = known % CYCLE
+    cycle = np.zeros(rows)
+    if np.ptp(phase):
+        step, first = np.polyfit(phase, ahead, 1)
+        if np.median(abs(ahead - first - step * phase)) < abs(step) / 10:
+            cycle = step * (np.arange(rows) % CYCLE)
+    return np.angle(mean) + cycle + np.interp(np.arange(rows), known, ahead - cycle[known])
 
 
-def _between(one: ndarray, other: ndarray, near: ndarray, far: ndarray, turn: float) -> ndarray:
-    """Times between two, by the distances to them; a turn apart, that of the nearer one."""
-    apart = near + far
-    share = np.where(apart > 0, near / np.where(apart > 0, apart, 1), 0)
-    split = abs(one - other) > turn / 2
-    return np.where(split & (near > far), other, np.where(split, one, one + share * (other - one)))
+def _nearest(row: ndarray, angle: ndarray, asked_row: ndarray, asked: ndarray) -> ndarray:
+    """The point of each ray, (K,), that is nearest by angle, in the nearest row with points."""
+    known = np.unique(row)
+    rows = np.arange(asked_row.max(initial=0) + 1)
+    instead = known[abs(rows[:, None] - known).argmin(axis=1)]
+    # Every row takes three turns: its points, and the same a turn before and after.
+    key = 3 * TURN * row + angle % TURN
+    keys = np.concatenate([key - TURN, key, key + TURN])
+    order = np.argsort(keys)
+    keys = keys[order]
+    wanted = 3 * TURN * instead[asked_row] + asked % TURN
+    after = np.searchsorted(keys, wanted)
+    before_is_nearer = wanted - keys[after - 1] < keys[after] - wanted
+    return order[after - before_is_nearer] % len(row)
