@@ -92,7 +92,8 @@ def training(name: str, rounded: bool = False) -> Work:
 def pictures() -> Work:
     """Four pictures of `r2flow show`."""
     from r2flow.lidar.sensors import SENSORS
-    from r2flow.reports.pictures import save_figure, scan_figure
+    from r2flow.reports.figures import save_figure
+    from r2flow.reports.pictures import scan_figure
     from r2flow.simulator import simulate
 
     sensor = SENSORS["hdl64e"]

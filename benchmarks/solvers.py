@@ -24,7 +24,7 @@ from r2flow.base.noise import Draws, standard_normal
 from r2flow.flow.problems import Discontinuous, Gaussian, Problem, RayDrop, Straight, TwoModes
 from r2flow.flow.solvers import Velocity, solve
 from r2flow.model.checkpoint import load_checkpoint
-from r2flow.reports.tables import table
+from r2flow.reports.tables import markdown
 
 ELEMENTS = 256
 TOLERANCES = (1e-2, 1e-3, 1e-4)
@@ -218,7 +218,7 @@ def main() -> None:
         "mixed batch": [RayDrop()],
         "with a jump in time": [RayDrop(), Discontinuous()],
     }.items():
-        print(f"\n{name}\n{table(mixed_batch(last, given.seeds), heading)}", flush=True)
+        print(f"\n{name}\n{markdown(mixed_batch(last, given.seeds), heading)}", flush=True)
     heading = ["solver", *(f"{tolerance:g}, evaluations: error" for tolerance in TOLERANCES)]
     for name, problem in PROBLEMS.items():
         starts = [
@@ -226,14 +226,15 @@ def main() -> None:
             for k in range(given.num)
         ]
         rows = single_scenes(problem, [(x, problem.solution(x, 1.0)) for x in starts])
-        print(f"\n{name}\n{table(rows, heading)}", flush=True)
+        print(f"\n{name}\n{markdown(rows, heading)}", flush=True)
     if given.checkpoint:
         flow = load_checkpoint(given.checkpoint).generator
         velocity: Velocity = flow.velocity  # type: ignore[assignment]
         starts = [Draws(0, range(k, k + 1)).start(flow.noise_shape) for k in range(given.num)]
         scenes = [(x, solve(velocity, x, method="dopri5", tolerance=1e-6).x) for x in starts]
         print(
-            f"\n{given.checkpoint}\n{table(single_scenes(velocity, scenes), heading)}", flush=True
+            f"\n{given.checkpoint}\n{markdown(single_scenes(velocity, scenes), heading)}",
+            flush=True,
         )
 
 

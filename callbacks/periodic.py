@@ -9,7 +9,8 @@ import torch
 from r2flow.base.registry import Count, Natural
 from r2flow.generators import Generator, Sampler
 from r2flow.model.sampling import draw
-from r2flow.reports.pictures import contact_sheet, figure_pixels, save_figure
+from r2flow.reports.figures import figure_pixels, save_figure
+from r2flow.reports.pictures import contact_sheet
 
 from .ema import averaged_weights
 from .loggers import log_picture

@@ -30,7 +30,7 @@ from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.parts import MODEL
-from r2flow.reports.pictures import save_figure
+from r2flow.reports.figures import save_figure
 from r2flow.stages import STAGES
 from r2flow.stages.base import Stage
 
@@ -268,7 +268,7 @@ def draw_quickly(patch: pytest.MonkeyPatch) -> None:
             return path
         return save_figure(figure, path, dpi=100, **about)
 
-    for module in ("pages", "pictures"):
+    for module in ("pages", "figures"):
         patch.setattr(f"r2flow.reports.{module}.save_figure", save)
 
 

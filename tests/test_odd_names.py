@@ -12,8 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from r2flow.base.errors import Harmless, InputError, explain_mistake
 from r2flow.base.files import atomic_write
-from r2flow.reports.pages import blank_figure
-from r2flow.reports.pictures import figure_pixels
+from r2flow.reports.figures import blank_figure, figure_pixels
 from tests.conftest import small_disk, write_scan
 
 ODD = [r"a$b$c", r"$\frac$", "a\nb", os.fsdecode(b"caf\xe9"), "ä ß 日", "-x", "a'b\"c"]

@@ -77,8 +77,8 @@ def ablate(
     from r2flow.model.checkpoint import Checkpoint
     from r2flow.reports.ablation import Judge, measure_run, read_rows, reference_rows, write_rows
     from r2flow.reports.ablation_page import COLUMNS, ablation_page
-    from r2flow.reports.pages import write_page
-    from r2flow.reports.tables import latex, print_markdown
+    from r2flow.reports.pages import print_text, write_page
+    from r2flow.reports.tables import latex
     from r2flow.runs.ablation import Ablation, training_cost
 
     where = choose_device(device)
@@ -123,7 +123,7 @@ def ablate(
         write_rows([*others, *stored], path)
     about = f"{several(seeds, 'seed')} of {seconds / 60:.3g} minutes each; {settings}."
     page = ablation_page(stored, list(ablation.variants), seconds, about, where)
-    print_markdown("\n\n".join(page.text))
+    print_text(page.text)
     written = [*write_page(page, out), path]
     if format == "tex":
         write_file(out / "ablation.tex", latex(page.rows, COLUMNS))

@@ -37,13 +37,12 @@ if TYPE_CHECKING:
     from r2flow.reports.tables import Row
 
 
-def _finish(page: "Page", out: Path, parts: int) -> None:
-    """Write a page; print its first parts and the paths of its files."""
-    from r2flow.reports.pages import write_page
-    from r2flow.reports.tables import print_markdown
+def _finish(page: "Page", out: Path) -> None:
+    """Print the text of a page; write it."""
+    from r2flow.reports.pages import print_text, write_page
 
-    print_markdown("\n\n".join(page.text[:parts]))
-    print("", *write_page(page, out), sep="\n")
+    print_text(page.text)
+    print(*write_page(page, out), sep="\n")
 
 
 @report.command(epilog="Example: r2flow report curvature runs/1rf runs/2rf --out reports")
@@ -74,7 +73,7 @@ def curvature(
             label: measure_paths(checkpoint, label, *how, progress=advance)
             for label, checkpoint in loaded.items()
         }
-    _finish(curvature_page(flows, draw.seed, where), out, 2)
+    _finish(curvature_page(flows, draw.seed, where), out)
 
 
 @report.command(epilog="Example: r2flow report solvers runs/NAME --out reports")
@@ -112,6 +111,7 @@ def solvers(
     from r2flow.flow.problems import PROBLEMS
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports import solvers as measuring
+    from r2flow.reports.pages import print_text
     from r2flow.reports.savings import savings
 
     where = choose_device(draw.device)
@@ -138,7 +138,7 @@ def solvers(
             methods if samplers else measuring.USUAL, budgets, measuring.TOLERANCES[:2]
         )
         first = measuring.measure([flow], usual)
-        print(*measuring.flow_text(first, flow), sep="\n\n", end="\n\n", flush=True)
+        print_text(measuring.flow_text(first, flow))
         saved = savings(loaded.generator, min(draw.num, 4), draw.seed)
         num = measuring.affordable(first, chosen, (until - time.monotonic()) / 2)
         num = min(num, draw.num)
@@ -152,7 +152,7 @@ def solvers(
     with Bar("measuring", len(subjects) * len(chosen), "solutions") as advance:
         rows = first + measuring.measure(subjects, chosen, advance, until)
     page = measuring.solvers_page(rows, flow, budgets, {"scans": draw.seed}, where, saved)
-    _finish(page, out, -2)  # without the long table
+    _finish(page, out)
 
 
 @report.command(epilog="Example: r2flow report backbones --size 64x1024")
@@ -239,7 +239,7 @@ def completion(
         rows = list(completion_rows(*given, progress=advance))
     about = f"{len(truths)} scans of {real} (at most {num}, --num), {answers} completions per scan."
     page = completion_page(rows, about, seed, where)
-    _finish(page, out, len(page.text))
+    _finish(page, out)
 
 
 def _completers(
@@ -303,7 +303,7 @@ def paper(
             raise InputError(f"{model} makes images of another size than {runs[0].label}.")
     scans = real and open_scans(real, reading_for([real], runs[0].checkpoint))
     check_folder(out)
-    _finish(paper_page(runs, rows, scans or None, steps, where), out, 1)
+    _finish(paper_page(runs, rows, scans or None, steps, where), out)
 
 
 def _role(text: str) -> tuple[str, str]:

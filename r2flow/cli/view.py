@@ -56,7 +56,8 @@ def show(
     """
     from r2flow.base.files import check_folder, save_array
     from r2flow.data.opening import describe
-    from r2flow.reports.pictures import STREET, save_figure, scan_figure, view_of
+    from r2flow.reports.figures import save_figure
+    from r2flow.reports.pictures import STREET, scan_figure, view_of
     from r2flow.reports.view.panels import scan_panels, share_scale
 
     if format == "npy" and out.resolve() in {

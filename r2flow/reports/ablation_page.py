@@ -10,8 +10,9 @@ from statistics import fmean, stdev
 from matplotlib.figure import Figure
 
 from r2flow.metrics.things import LINES
-from r2flow.reports.pages import Page, Plot, lines_figure
-from r2flow.reports.tables import Row, table
+from r2flow.reports.figures import Plot, lines_figure
+from r2flow.reports.pages import Page
+from r2flow.reports.tables import Part, Row, Table
 
 DISTANCE = "distance of ranges"
 COLUMNS = {
@@ -120,13 +121,13 @@ def ablation_page(
     lines = [references[0], *(row for each in systems.values() for row in each), last]
     against = compared(systems)
     headings = {key: key for row in learned.values() for key in row}
-    text = [
+    text: list[Part] = [
         f"{next(iter(systems))} at equal seconds a scan, by network evaluations:",
-        table(against, {key: key for key in against[0]}),
+        Table(against, {key: key for key in against[0]}),
         f"Smallest distance by training time; {last['combination']}: {last[DISTANCE]:.3f}.",
-        table(list(learned.values()), headings),
+        Table(list(learned.values()), headings),
         about,
-        table(lines, COLUMNS),
+        Table(lines, COLUMNS),
         RULE,
     ]
     figures = {"ablation": _figure(systems, [references[0], last])}

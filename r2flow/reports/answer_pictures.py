@@ -11,7 +11,8 @@ from r2flow.lidar.labels import semantic_ids
 from r2flow.lidar.other_sensors import Partial
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.completion import Completed
-from r2flow.reports.pictures import contact_sheet, save_figure, trust_ids
+from r2flow.reports.figures import save_figure
+from r2flow.reports.pictures import contact_sheet, trust_ids
 from r2flow.reports.view import Panel, write_viewer
 
 if TYPE_CHECKING:
@@ -36,11 +37,9 @@ def draw_answers(
     """
     rays = sensor.rays()
     answers = completed.images.numpy()[:_MOST]
-    several = len(answers) > 1
-    names = [
-        "your scan",
-        *(f"completed, answer {i}" if several else "completed" for i in range(len(answers))),
-    ]
+    names = ["your scan", "completed"]
+    if len(answers) > 1:
+        names = ["your scan", *(f"completed, answer {i}" for i in range(len(answers)))]
     images = [given.image, *answers]
     title = scan.name
     if compared:
@@ -54,13 +53,14 @@ def draw_answers(
         ids = [semantic_ids(image[2]) if len(image) > 2 else None for image in images]
     elif completed.densities:
         errors = completed.error(0.68)[0, : len(answers)].numpy()
-        for place, error in enumerate([np.zeros_like(errors[0]), *errors]):
-            ids[place] = trust_ids(images[place], error)
+        ids[: 1 + len(answers)] = map(trust_ids, images, [np.zeros_like(errors[0]), *errors])
     images = [image[: min(len(given.image), 2)] for image in images]
     panels = [
         Panel(name, image[None], rays, None if one is None else one[None])
         for name, image, one in zip(names, images, ids, strict=True)
     ]
     write_viewer(out / f"{scan.name}.html", panels, title)
+    if completed.densities:
+        ids[0] = None  # all of it was measured
     figure = contact_sheet(images, rays, names, given.state == Ray.UNKNOWN, ids)
     save_figure(figure, out / f"{scan.name}.png")

@@ -23,7 +23,7 @@ from r2flow.reports.outputs import what_next, write_samples
 from r2flow.reports.pages import write_page
 from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.runs import read_runs
-from r2flow.reports.tables import Row, print_table, table
+from r2flow.reports.tables import Row, Table, print_table
 from r2flow.samplers import FixedSteps
 
 REPORT = "compare.md"  # the last file of a report
@@ -88,7 +88,7 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
             "row needs no network."
         )
     page = compare_page({run.label: [run] for run in read_runs(list(runs.values()))})
-    page = replace(page, text=[about, table(rows, _COLUMNS), "\n".join(said), *page.text])
+    page = replace(page, text=[about, Table(rows, _COLUMNS), "\n".join(said), *page.text])
     images = [scans[0] for _, scans in drawn]
     page.figures["steps"] = contact_sheet(images, last.sensor.rays(), captions)
     write_samples(last, out, num=4, seed=0, pictures=4, replace=True)

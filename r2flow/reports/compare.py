@@ -11,7 +11,7 @@ from r2flow.base.config import flatten
 from r2flow.model.config import learned
 from r2flow.reports.pages import Page
 from r2flow.reports.runs import ComparedRun
-from r2flow.reports.tables import Row, latex, print_table, table
+from r2flow.reports.tables import Row, Table, latex, print_table
 from r2flow.reports.training import curves_figure
 from r2flow.runs.folder import read_config
 
@@ -163,7 +163,7 @@ def compare_page(groups: Groups) -> Page:
     seeds = {run.label: int(run.config["seed"]) for _, run in members if "seed" in run.config}
     text = []
     for title, (rows, columns) in _tables(groups).items():
-        text += [f"## {title}", table(rows, columns)]
+        text.append(Table(rows, columns, title))
     figures = {}
     if any(run.curves for _, run in members):
         figures["compare"] = curves_figure([(label, run.curves) for label, run in members])

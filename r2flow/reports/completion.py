@@ -19,7 +19,7 @@ from r2flow.metrics.panel import distances, mean_distance, panel
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import complete
 from r2flow.reports.pages import Page
-from r2flow.reports.tables import Row, table
+from r2flow.reports.tables import Part, Row, Table
 
 TASKS = ("rows:4", "rows:2", "random:0.5", "points:0.1", "sector:-11.25,11.25")
 _COLUMNS = {
@@ -120,7 +120,7 @@ def _mean_row(rows: Sequence[Row]) -> Row:
 
 def completion_page(rows: Sequence[Row], about: str, seed: int, device: str) -> Page:
     """Build the page: a table per task."""
-    text = [
+    text: list[Part] = [
         f"{about} Figures are of the hidden rays, means over scans and answers, unless their name "
         "says otherwise: "
         "`MAE, all pixels` is LiDARGen's and RangeLDM's, IoU and Chamfer are of whole scans with "
@@ -134,5 +134,5 @@ def completion_page(rows: Sequence[Row], about: str, seed: int, device: str) -> 
         part = [row for row in rows if row["task"] == task]
         known = {key for row in part for key in row}
         columns = {key: heading for key, heading in _COLUMNS.items() if key in known}
-        text += [f"## {task}", table(part, columns)]
+        text.append(Table(part, columns, task))
     return Page("completion", "Completed scans", text, rows, {}, {"noise": seed}, device)

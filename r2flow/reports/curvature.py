@@ -13,8 +13,9 @@ from r2flow.flow.straightness import Straightness, straightness
 from r2flow.generators import as_flow
 from r2flow.generators.base import Progress
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.reports.pages import Page, Plot, blank_figure, lines_figure
-from r2flow.reports.tables import Row, short_names, table
+from r2flow.reports.figures import Plot, blank_figure, lines_figure
+from r2flow.reports.pages import Page
+from r2flow.reports.tables import Part, Row, Table, short_names
 
 _log = logging.getLogger(__name__)
 
@@ -79,7 +80,7 @@ def summary(label: str, flow: Straightness) -> Row:
     }
 
 
-def curvature_text(flows: Flows) -> list[str]:
+def curvature_text(flows: Flows) -> list[Part]:
     """Text: definition of s(t), and the table of flows."""
     first = next(iter(flows.values()))
     about = (
@@ -91,7 +92,7 @@ def curvature_text(flows: Flows) -> list[str]:
         "compare int s dt over "
         "the squared length |x_1 - x_0|^2."
     )
-    return [about, table([summary(*flow) for flow in flows.items()], _COLUMNS)]
+    return [about, Table([summary(*flow) for flow in flows.items()], _COLUMNS)]
 
 
 def curvature_figure(flows: Flows) -> Figure:

@@ -9,8 +9,9 @@ from matplotlib.figure import Figure
 
 from r2flow.evaluation.comparing import Comparison, Comparisons
 from r2flow.metrics.panel import PANEL
-from r2flow.reports.pages import Page, Plot, lines_figure
-from r2flow.reports.tables import Row, print_table, table
+from r2flow.reports.figures import Plot, lines_figure
+from r2flow.reports.pages import Page
+from r2flow.reports.tables import Part, Row, Table, print_table
 from r2flow.reports.verdict import heading, remarks_of, verdict
 
 _THINGS = {
@@ -68,9 +69,9 @@ def evaluation_page(comparisons: Comparisons, device: str, seeds: Mapping[str, i
     of models.
     """
     columns, lines = _table(comparisons)
-    text = [
+    text: list[Part] = [
         _protocol(comparisons),
-        table(lines, columns),
+        Table(lines, columns),
         "\n".join(f"- {remark}" for remark in remarks_of(comparisons)),
         *verdict(comparisons),
     ]

@@ -16,7 +16,7 @@ from r2flow.model.inversion import interpolate_scans, round_trip
 from r2flow.model.sampling import warn_unsolved
 from r2flow.reports.pages import Page
 from r2flow.reports.pictures import contact_sheet
-from r2flow.reports.tables import table
+from r2flow.reports.tables import Part, Table
 from r2flow.reports.view import Panel, most_images, write_viewer
 
 
@@ -53,12 +53,12 @@ def interpolation(
     captions = [f"w = {row['weight']:.2f}" for row in rows]
     errors = round_trip(checkpoint, result.ends)
     off = ", ".join(f"{error:.2g} m" for error in errors["median_m"].tolist())
-    text = [
+    text: list[Part] = [
         f"The flow of {checkpoint.path.name}, step {checkpoint.step}, inverted both scans to noise "
         "and generated the frames from spherical interpolations (slerp) of it. The first and last "
         f"frames are round trips of the scans (median error of the range {off}); their evaluations "
         "include both directions.",
-        table(rows, {key: key for key in rows[0]}),
+        Table(rows, {key: key for key in rows[0]}),
     ]
     titles = [f"real: {name}" for name in names]
     real = pair.numpy()

@@ -25,7 +25,8 @@ from r2flow.model.completion import label
 from r2flow.model.paths import title_of
 from r2flow.model.sampling import draw, warn_unsolved
 from r2flow.model.saving import weights_hash
-from r2flow.reports.pictures import contact_sheet, save_figure, scan_figure
+from r2flow.reports.figures import save_figure
+from r2flow.reports.pictures import contact_sheet, scan_figure
 from r2flow.reports.view import most_images, panel_of, write_viewer
 from r2flow.store import MANIFEST, FileStore, read_manifest
 

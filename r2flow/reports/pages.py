@@ -1,4 +1,4 @@
-"""Reports: figures, JSON and Markdown, each with its provenance."""
+"""Pages of reports: figures, JSON and Markdown, each with its provenance."""
 
 import json
 import math
@@ -11,24 +11,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from textwrap import indent
+from typing import Any
 
-import numpy as np
 import torch
 from matplotlib.figure import Figure
 
 import r2flow
 from r2flow.base.files import write_file
-from r2flow.reports.pictures import save_figure
-from r2flow.reports.tables import Row, words
-
-# Markers and dashes distinguish lines without colour.
-STYLES: tuple[Row, ...] = tuple(
-    {"marker": marker, "linestyle": dash, "color": f"C{number}"}
-    for number, (marker, dash) in enumerate(
-        zip("os^DvPX*<>", ("-", "--", "-.", ":", "-") * 2, strict=True)
-    )
-)
+from r2flow.reports.figures import save_figure
+from r2flow.reports.tables import Part, Row, Table, markdown, print_table, words
 
 
 def command() -> str:
@@ -41,16 +33,31 @@ def command() -> str:
 
 @dataclass(frozen=True)
 class Page:
-    """Contents of a report."""
+    """Contents of a report.
+
+    `text` is printed and written, `details` are written below it. `rows` and `more` go into the
+    JSON.
+    """
 
     name: str  # stem of the files, such as `solvers`
     title: str
-    text: Sequence[str]
+    text: Sequence[Part]
     rows: Sequence[Row]
-    figures: dict[str, Figure]
+    figures: dict[str, Figure] = field(default_factory=dict)
     seeds: Mapping[str, int] = field(default_factory=dict)
     device: str = "cpu"
     more: Mapping[str, Sequence[Row]] = field(default_factory=dict)
+    details: Sequence[Part] = ()
+
+
+def print_text(parts: Sequence[Part]) -> None:
+    """Print texts and tables, an empty line after each."""
+    for part in parts:
+        if isinstance(part, Table):
+            print_table(*part)
+        else:
+            print(part)
+        print(flush=True)
 
 
 def write_page(page: Page, out: Path) -> list[Path]:
@@ -101,51 +108,6 @@ def _provenance(page: Page) -> Row:
     }
 
 
-def blank_figure(width: float, height: float) -> Figure:
-    """Create an empty figure, sized in inches."""
-    return Figure(figsize=(width, height), facecolor="white", layout="constrained")
-
-
-class Plot(NamedTuple):
-    """Lines in one panel of a figure."""
-
-    x: str  # labels of the axes
-    y: str
-    lines: Mapping[str, tuple[Any, Any]]  # x and y by label
-    title: str = ""
-    log_x: bool = False
-
-
-def lines_figure(plots: Sequence[Plot], columns: int) -> Figure:
-    """Draw plots in rows of `columns`; equal labels share a style.
-
-    The y axis is logarithmic if its values are positive and differ by more than three times. The
-    legend is left out if there are more labels than styles.
-    """
-    labels = list(dict.fromkeys(label for plot in plots for label in plot.lines))
-    columns = min(columns, len(plots))
-    rows = math.ceil(len(plots) / columns)
-    legend = len(labels) <= len(STYLES)
-    figure = blank_figure(4.2 * columns + 0.4, 3.3 * rows + (0.18 * len(labels) if legend else 0))
-    for place, plot in enumerate(plots, 1):
-        axes = figure.add_subplot(rows, columns, place)
-        for label, (x, y) in plot.lines.items():
-            style = STYLES[labels.index(label) % len(STYLES)]
-            interval = max(len(x) // 8, 1)
-            axes.plot(x, y, **style, ms=4, lw=1.1, markevery=interval, label=label)
-        axes.set(xlabel=plot.x, ylabel=plot.y, xscale="log" if plot.log_x else "linear")
-        axes.set_title(plot.title, fontsize=9)
-        values = [v for _, y in plot.lines.values() for v in np.ravel(y) if math.isfinite(v)]
-        if values and 0 < 3 * min(values) < max(values):  # else its labels would be 1.11 x 10^0
-            axes.set_yscale("log")
-        axes.grid(color="0.88", lw=0.6)
-        axes.tick_params(which="both", labelsize=8)
-    if legend:
-        handles = {line.get_label(): line for axes in figure.axes for line in axes.lines}
-        figure.legend(handles=handles.values(), fontsize=8, loc="outside lower left", frameon=False)
-    return figure
-
-
 def _plain(value: Any) -> Any:
     """Convert values for JSON, which has no NaN or infinity."""
     if isinstance(value, Mapping):
@@ -159,18 +121,19 @@ def _plain(value: Any) -> Any:
 
 def _markdown(page: Page, origin: Mapping[str, Any]) -> str:
     pictures = [f"![{name.replace('_', ' ')}]({name}.png)" for name in page.figures]
+    text = [
+        markdown(*part) if isinstance(part, Table) else part for part in (*page.text, *page.details)
+    ]
     notes = [
         f"- {key}: {words(value) if isinstance(value, Mapping) else value}"
         for key, value in origin.items()
         if key not in ("report", "command")
     ]
-    runs = re.findall("`+", origin["command"])
-    fence = "`" * max(3, *(1 + len(run) for run in runs), 3)  # no name ends it
-    texts = [f"# {page.title}", *pictures, *page.text, "## Where this comes from", "Made with"]
-    code = f"{fence}\n{origin['command']}\n{fence}"
-    # names are no HTML
-    before, after = (text.replace("<", "&lt;") for text in ("\n\n".join(texts), "\n".join(notes)))
-    return f"{before}\n\n{code}\n\n{after}\n"
+    parts = [f"# {page.title}", *pictures, *text, "## Where this comes from", "Made with"]
+    before, after = (  # names are no HTML
+        text.replace("<", "&lt;") for text in ("\n\n".join(parts), "\n".join(notes))
+    )
+    return f"{before}\n\n{indent(origin['command'], '    ')}\n\n{after}\n"
 
 
 def _cpu_name() -> str:

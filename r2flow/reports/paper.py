@@ -26,7 +26,7 @@ from r2flow.reports.curvature import (
 from r2flow.reports.evaluation import sampled_rows, speed_figure
 from r2flow.reports.pages import Page
 from r2flow.reports.pictures import contact_sheet
-from r2flow.reports.tables import Row, shown, table
+from r2flow.reports.tables import Part, Row, Table, shown
 from r2flow.reports.verdict import PRINTED
 
 _PRINTED = yaml.safe_load(Path(__file__).with_name("printed.yaml").read_text(encoding="utf-8"))
@@ -112,15 +112,13 @@ def paper_page(
         )
     architectures = _architecture_rows(runs, evaluated, device)
     protocols = "; ".join(dict.fromkeys(row["protocol"] for row in evaluated))
-    text = [
+    text: list[Part] = [
         f"Generators: {names}.",
-        "## Table I: methods and metrics",
         _table_i(evaluated),
         f"Evaluated rows: {protocols or 'none'}. Printed rows: {_PROTOCOL} kitti_360. Figures with "
         "* are of another "
         "protocol than printed ones, and not comparable.",
-        "## Table II: velocity estimators",
-        table(architectures, _ARCHITECTURES),
+        Table(architectures, _ARCHITECTURES, "Table II: velocity estimators"),
     ]
     figures = {"figure_7": _scans_figure(runs, real)}
     metrics = [f"{name}/{name}" for name in COLUMNS]
@@ -171,7 +169,7 @@ def read_results(files: Sequence[Path]) -> list[Row]:
     return rows
 
 
-def _table_i(rows: Sequence[Row]) -> str:
+def _table_i(rows: Sequence[Row]) -> Table:
     """Table I as printed, with evaluated rows below: those of equal evaluations, or the most if
     both are many.
 
@@ -191,7 +189,8 @@ def _table_i(rows: Sequence[Row]) -> str:
         left = [row for row in left if row not in below]
     lines += map(_evaluated_line, left)
     columns = {"method": "method", "of": "figures of", "evaluations": "NFE"}
-    return table(lines, columns | {name: title for name, (title, _) in COLUMNS.items()})
+    columns |= {name: title for name, (title, _) in COLUMNS.items()}
+    return Table(lines, columns, "Table I: methods and metrics")
 
 
 def _evaluated_line(row: Row) -> Row:

@@ -1,27 +1,20 @@
 """Scans as pictures in the width of a paper's page: images, bird's-eye view, 3-D perspective."""
 
-import logging
-import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib import colormaps, rc_context
+from matplotlib import colormaps
 from matplotlib.artist import Artist, allow_rasterization
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize, to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import BboxImage
 from matplotlib.patches import Patch
-from matplotlib.text import Text
 from matplotlib.transforms import Bbox, TransformedBbox
 from torch import Tensor
 
-from r2flow.base.errors import printable
-from r2flow.base.files import atomic_write
 from r2flow.lidar.labels import CLASSES, semantic_ids
 from r2flow.lidar.projection import image_to_points
 
@@ -32,14 +25,14 @@ _ROOM = 15.0  # metres of reach up to which the camera stands behind a room, fou
 # Its axes as columns: right, up, ahead; pitched down by 18 degrees.
 _AXES = np.array([[0, 0.3090, 0.9511], [-1, 0, 0], [0, 0.9511, -0.3090]])
 
-
 # Ids, names and colours of points by the metres within which they are right in 68 %.
 _LIMITS = (0.05, 0.2, 1.0)
+TRUST_TITLE = "predicted error (68 %)"
 TRUST = {
-    65000: ("measured", "#8d949e"),
-    65001: ("added, within 0.05 m", "#2f9e44"),
-    65002: ("within 0.2 m", "#fcc419"),
-    65003: ("within 1 m", "#f76707"),
+    65000: ("measured", "#74c0fc"),
+    65001: ("added, up to 0.05 m", "#2f9e44"),
+    65002: ("up to 0.2 m", "#fcc419"),
+    65003: ("up to 1 m", "#f76707"),
     65004: ("more", "#c92a2a"),
 }
 
@@ -87,10 +80,9 @@ def scan_figure(
     `view`: default: that of the scan (`view_of`); `STREET` for all scans makes pictures comparable.
     `labels`: semantic ids, (H, W); default: those of a labelled model's image.
     """
-    if labels is None and len(image) > 2:
-        labels = semantic_ids(image[2])
+    if labels is None:
+        labels = _labels_of(image)
     image = image[:2]
-    view = view or view_of((image, rays))
     figure = Figure((_WIDTH, 4.6), facecolor="white")
     strips = len(image) + (labels is not None)
     grid = figure.add_gridspec(
@@ -105,12 +97,9 @@ def scan_figure(
         top=0.89,
         bottom=0.01,
     )
-    _draw_image([figure.add_subplot(grid[row, :]) for row in range(len(image))], image, view)
-    if labels is not None:
-        _draw_labels(figure.add_subplot(grid[-2, :]), labels)
-    xyz, _ = image_to_points(image, rays)
-    _draw_birds_eye(figure.add_subplot(grid[-1, 0]), xyz, view)
-    _draw_perspective(figure.add_subplot(grid[-1, 1]), xyz, view)
+    view = view or view_of((image, rays))
+    _draw_strips([figure.add_subplot(grid[row, :]) for row in range(strips)], image, labels, view)
+    _draw_views([figure.add_subplot(grid[-1, i]) for i in (0, 1)], image, rays, view)
     returned = image[0] > 0
     size = " x ".join(map(str, returned.shape))
     about = f"{title}   {size}, {returned.sum():,} returns ({returned.mean():.0%})".strip()
@@ -128,77 +117,84 @@ def contact_sheet(
     """Draw several scans in their common view, one per row: range, reflectance and labels on the
     left, bird's-eye view and perspective on the right.
 
-    Rays of the first scan that were not measured, (H, W) bool, are grey. `labels`: semantic ids or
+    Rays of the first scan that were not measured, (H, W) bool, are white. `labels`: semantic ids or
     those of `TRUST`, (H, W) each; default: those of a labelled model's images.
     """
     if labels is None:
-        classes = [image[2] if len(image) > 2 and image[2].any() else None for image in images]
-        labels = [None if one is None else semantic_ids(one) for one in classes]
+        labels = [_labels_of(image) for image in images]
     images = [image[:2] for image in images]
     view = view_of(*((image, rays) for image in images))
-    labelled = any(one is not None for one in labels)
-    height = (1.85 if labelled else 1.35) * len(images) + 0.18
+    heights = [1.35 + 0.5 * (ids is not None) for ids in labels]
+    heights[0] += 0.15 * (unmeasured is not None)
+    height = sum(heights) + 0.18
     figure = Figure((_WIDTH, height), facecolor="white")
     grid = figure.add_gridspec(
         len(images),
         3,
+        height_ratios=heights,
         width_ratios=[2.6, 0.9, 1.3],
         hspace=0.24,
         wspace=0.13,
         left=0.01,
         right=0.94,
         top=1 - 0.18 / height,
-        bottom=0.14 / height if labelled else 0.02,  # below is a legend
+        bottom=0.02 if labels[-1] is None else 0.14 / height,  # below is a legend
     )
-    for row, image in enumerate(images):
-        label = row == 0
-        cells = grid[row, 0].subgridspec(len(image) + labelled, 1, hspace=0.25)
-        strips = [figure.add_subplot(cells[channel]) for channel in range(len(image))]
-        _draw_image(strips, image, view, label)
-        xyz, _ = image_to_points(image, rays)
-        _draw_birds_eye(figure.add_subplot(grid[row, 1]), xyz, view, label)
-        _draw_perspective(figure.add_subplot(grid[row, 2]), xyz, view, label)
-        if (ids := labels[row]) is not None:
-            _draw_labels(figure.add_subplot(cells[-1]), ids)
-        if label and unmeasured is not None:
-            grey = np.where(unmeasured[..., None], (0.6, 0.6, 0.6, 1), 0)
-            for axes in strips:
-                axes.imshow(grey, aspect="auto", interpolation="nearest")
-        if row < len(titles):
-            about = f"{titles[row]}: range, m" if label else titles[row]
-            strips[0].set_title(about, fontsize=7, loc="left", pad=2)
+    for row, (image, ids) in enumerate(zip(images, labels, strict=True)):
+        count = len(image) + (ids is not None)
+        cells = grid[row, 0].subgridspec(count, 1, hspace=0.3)
+        strips = [figure.add_subplot(cells[i]) for i in range(count)]
+        title = titles[row] if row < len(titles) else ""
+        _draw_strips(strips, image, ids, view, title, row == 0)
+        views = [figure.add_subplot(grid[row, i]) for i in (1, 2)]
+        _draw_views(views, image, rays, view, row == 0)
+        if row == 0 and unmeasured is not None:
+            white = np.repeat(unmeasured[..., None], 4, axis=2).astype(float)
+            for axes in strips[: len(image)]:
+                axes.imshow(white, aspect="auto", interpolation="nearest")
+            _add_legend(axes, {"not measured": "white", "measured, no return": "black"})
     return figure
 
 
-def _draw_image(strips: Sequence[Any], image: np.ndarray, view: View, label: bool = True) -> None:
-    """Draw range on a logarithmic scale and the root of reflectance, dropped rays black."""
+def _labels_of(image: np.ndarray) -> np.ndarray | None:
+    """Semantic ids of a labelled model's image, if it has any."""
+    return semantic_ids(image[2]) if len(image) > 2 and image[2].any() else None
+
+
+def _draw_strips(
+    strips: Sequence[Any],
+    image: np.ndarray,
+    labels: np.ndarray | None,
+    view: View,
+    title: str = "",
+    first: bool = True,
+) -> None:
+    """Draw range on a logarithmic scale, the root of reflectance and labels; dropped rays black.
+
+    `first`: with colour bars and titles.
+    """
     dropped = image[0] <= 0
     near, far = view.ranges
     ticks = {r: float(np.log(r)) for r in (near, np.sqrt(near * far), far)}
-    _draw_values(
-        strips[0], dropped, np.log(np.maximum(image[0], 1e-3)), "range", ticks, "range, m", label
-    )
+    title = ": ".join(filter(None, (title, "range, m" if first else "")))
+    values = np.ma.masked_where(dropped, np.log(np.maximum(image[0], 1e-3)))
+    _draw_values(strips[0], values, "range", ticks, title, first)
     if len(image) > 1:
-        root = np.sqrt(np.clip(image[1], 0, 1))
+        values = np.ma.masked_where(dropped, np.sqrt(np.clip(image[1], 0, 1)))
         ticks = {0: 0.0, 0.2: 0.2**0.5, 0.8: 0.8**0.5}
-        _draw_values(strips[1], dropped, root, "reflectance", ticks, "reflectance", label)
+        _draw_values(strips[1], values, "reflectance", ticks, "reflectance" if first else "", first)
+    if labels is not None:
+        _draw_labels(strips[-1], labels)
 
 
 def _draw_values(
-    axes: Any,
-    dropped: np.ndarray,
-    values: np.ndarray,
-    what: str,
-    ticks: dict[float, float],
-    title: str,
-    label: bool,
+    axes: Any, values: np.ndarray, what: str, ticks: Mapping[float, float], title: str, bar: bool
 ) -> None:
-    first, *_, last = ticks.values()
-    scale = ScalarMappable(Normalize(first, last), colours(what))
-    drawn = scale.to_rgba(np.ma.masked_where(dropped, values), bytes=True)
-    axes.imshow(drawn, aspect="auto", interpolation="nearest")
-    _frame(axes, title, label, "black")
-    if label:
+    low, *_, high = ticks.values()
+    scale = ScalarMappable(Normalize(low, high), colours(what))
+    axes.imshow(scale.to_rgba(values, bytes=True), aspect="auto", interpolation="nearest")
+    _frame(axes, title, "black")
+    if bar:
         _add_bar(axes, scale, ticks)
 
 
@@ -209,19 +205,10 @@ def _draw_labels(axes: Any, labels: np.ndarray) -> None:
     for number, (_, value) in classes.items():
         colour[labels == number] = to_rgb(value)
     axes.imshow(colour, aspect="auto", interpolation="nearest")
-    legend = [Patch(color=value, label=name) for name, value in classes.values()]
-    axes.legend(
-        handles=legend,
-        loc="upper left",
-        bbox_to_anchor=(0, 0),
-        borderpad=0,
-        ncols=len(legend),
-        columnspacing=1.2,
-        fontsize=4.5,
-        frameon=False,
-        handlelength=1,
-    )
-    _frame(axes, "error" if classes.keys() & TRUST.keys() else "label", True, "black")
+    trusted = classes.keys() & TRUST.keys()
+    black = {"no return": "black"} if trusted else {}
+    _add_legend(axes, {**dict(classes.values()), **black})
+    _frame(axes, TRUST_TITLE if trusted else "label", "black")
 
 
 def class_colours(labels: np.ndarray, most: int) -> dict[int, tuple[str, str]]:
@@ -232,37 +219,40 @@ def class_colours(labels: np.ndarray, most: int) -> dict[int, tuple[str, str]]:
     """
     ids, counts = np.unique(labels, return_counts=True)
     ordered = ids[np.argsort(-counts)][:most].tolist()
-    if all(label in TRUST for label in ids.tolist()):
+    if TRUST.keys() >= set(ordered):
         return {label: TRUST[label] for label in sorted(ordered)}
-    if all(label in CLASSES for label in ids.tolist()):
+    if CLASSES.keys() >= set(ids.tolist()):
         return {label: CLASSES[label] for label in ordered}
     hues = colormaps["hsv"]  # the golden ratio separates the hues of neighbouring ids
     return {label: (f"class {label}", to_hex(hues(label * 0.618034 % 1))) for label in ordered}
 
 
-def _draw_birds_eye(axes: Any, xyz: np.ndarray, view: View, label: bool = True) -> None:
-    """Draw points from above, driving direction upwards, coloured by height."""
+def _draw_views(
+    panels: Sequence[Any], image: np.ndarray, rays: Tensor, view: View, first: bool = True
+) -> None:
+    """Draw points from above, driving direction upwards, and by a pinhole camera behind and above
+    the sensor, coloured by height.
+    """
+    above, ahead = panels
     reach = view.reach
-    x, y, z = xyz[(np.abs(xyz[:, :2]) < reach).all(axis=1)].T
-    _draw_points(axes, -y, x, z, np.clip(6_000 / max(len(x), 1), 0.2, 1.0), view)
-    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
-    axes.plot(0, 0, marker="^", color="black", ms=3)
-    _frame(axes, f"bird's-eye view, {2 * reach:.0f} m", label)
+    points, _ = image_to_points(image, rays)
+    x, y, z = points[(np.abs(points[:, :2]) < reach).all(axis=1)].T
+    _draw_points(above, -y, x, z, np.clip(6_000 / max(len(x), 1), 0.2, 1.0), view)
+    above.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+    above.plot(0, 0, marker="^", color="black", ms=3)
+    _frame(above, f"bird's-eye view, {2 * reach:.0f} m" if first else "")
 
-
-def _draw_perspective(axes: Any, xyz: np.ndarray, view: View, label: bool = True) -> None:
-    """Draw points by a pinhole camera behind and above the sensor, coloured by height."""
-    eye = _EYE * (1 if view.reach > _ROOM else 4)
-    seen = np.column_stack([(xyz / view.reach - eye) @ _AXES, xyz[:, 2]])
+    eye = _EYE * (1 if reach > _ROOM else 4)
+    seen = np.column_stack([(points / reach - eye) @ _AXES, points[:, 2]])
     seen = seen[seen[:, 2] > 0.06]
     x, y, depth, z = seen[np.argsort(-seen[:, 2])].T
-    size = np.clip(0.14 / depth, 0.3, 0.8) * np.sqrt(30_000 / max(len(xyz), 1))
-    dots = _draw_points(axes, x / depth, y / depth, z, size, view)
-    axes.set(xlim=(-0.95, 0.95), ylim=(-0.62, 0.48), aspect="equal")
-    _frame(axes, "perspective, colour: height, m", label)
-    if label:
+    size = np.clip(0.14 / depth, 0.3, 0.8) * np.sqrt(30_000 / max(len(points), 1))
+    heights = _draw_points(ahead, x / depth, y / depth, z, size, view)
+    ahead.set(xlim=(-0.95, 0.95), ylim=(-0.62, 0.48), aspect="equal")
+    _frame(ahead, "perspective, colour: height, m" if first else "")
+    if first:
         low, high = view.heights
-        _add_bar(axes, dots, {z: z for z in (low, (low + high) / 2, high)})
+        _add_bar(ahead, heights, {z: z for z in (low, (low + high) / 2, high)})
 
 
 class _Dots(Artist):
@@ -297,49 +287,11 @@ class _Dots(Artist):
 
 def _draw_points(
     axes: Any, x: np.ndarray, y: np.ndarray, z: np.ndarray, size: Any, view: View
-) -> Any:
-    height = ScalarMappable(Normalize(*view.heights), "turbo")
+) -> ScalarMappable:
+    heights = ScalarMappable(Normalize(*view.heights), "turbo")
     sizes = np.broadcast_to(size, x.shape)
-    axes.add_artist(_Dots(np.column_stack([x, y]), height.to_rgba(z, bytes=True), sizes))
-    return height
-
-
-def _show_names_literally(figure: Figure) -> None:
-    """Show characters of file names as they are: only tick labels parse formulas."""
-    warnings.filterwarnings("ignore", "Glyph .* missing from font")  # no font has all of them
-    for text in figure.findobj(Text):
-        content = printable(text.get_text())
-        text.set(text=content, usetex=False)
-        if "$" in content and not content.startswith(r"$\mathdefault"):
-            text.set_parse_math(False)
-
-
-def save_figure(
-    figure: Figure, path: Path, dpi: int = 300, title: str = "", about: str = ""
-) -> Path:
-    """Write a PNG or PDF with its title and what it is about, atomically; equal figures have equal
-    files.
-    """
-    notes: dict[str, Any] = {"Title": title, "Description": about}
-    how: dict[str, Any] = {"pil_kwargs": {"compress_level": 1}}  # a third faster, a fifth larger
-    if path.suffix == ".pdf":
-        notes = {"Title": title, "Subject": about, "CreationDate": None}
-        how = {}
-    _show_names_literally(figure)
-    logging.getLogger("fontTools").setLevel(logging.WARNING)  # it logs 100 lines for a PDF
-    settings: Any = {"pdf.fonttype": 42, "text.usetex": False}  # publishers refuse Type 3 fonts
-    with atomic_write(path) as file, rc_context(settings):
-        figure.savefig(file, format=path.suffix[1:], dpi=dpi, metadata=notes, **how)
-    return path
-
-
-def figure_pixels(figure: Figure, dpi: int = 160) -> np.ndarray:
-    """Render the figure as (height, width, 3) uint8."""
-    _show_names_literally(figure)
-    figure.set_dpi(dpi)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    axes.add_artist(_Dots(np.column_stack([x, y]), heights.to_rgba(z, bytes=True), sizes))
+    return heights
 
 
 @cache
@@ -354,14 +306,28 @@ def colours(what: str) -> Any:
     return scale.with_extremes(bad="black")
 
 
-def _frame(axes: Any, title: str, label: bool, background: str = "white") -> None:
+def _frame(axes: Any, title: str, background: str = "white") -> None:
     axes.set(xticks=[], yticks=[], facecolor=background)
     axes.spines[:].set(color="0.7", linewidth=0.5)
-    if label:
-        axes.set_title(title, fontsize=7, loc="left", pad=2)
+    axes.set_title(title, fontsize=7, loc="left", pad=2)
 
 
-def _add_bar(axes: Any, scale: Any, ticks: dict[float, float]) -> None:
+def _add_legend(axes: Any, names: Mapping[str, str]) -> None:
+    """Explain colours, by name, below some axes."""
+    axes.legend(
+        handles=[Patch(fc=colour, ec="0.7", lw=0.5, label=name) for name, colour in names.items()],
+        loc="upper left",
+        bbox_to_anchor=(0, 0),
+        borderpad=0,
+        ncols=len(names),
+        columnspacing=1.2,
+        fontsize=5,
+        frameon=False,
+        handlelength=1,
+    )
+
+
+def _add_bar(axes: Any, scale: Any, ticks: Mapping[float, float]) -> None:
     """Draw a colour bar to the right, without axes of its own, which take as long as the rest."""
     place = TransformedBbox(Bbox.from_bounds(1.012, 0, 0.014, 1), axes.transAxes)
     bar = BboxImage(place, cmap=scale.cmap, norm=scale.norm, clip_on=False)

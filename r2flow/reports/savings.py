@@ -13,7 +13,7 @@ from r2flow.generators import Flow, Generator, as_flow
 from r2flow.lidar.region import MARGIN, region
 from r2flow.model.sampling import evaluated_region
 from r2flow.reports.backbones import timed
-from r2flow.reports.tables import Row, table
+from r2flow.reports.tables import Part, Row, Table
 
 _TOLERANCE = 1e-3
 _END = 1 / 32  # before t = 1, where one Euler step ends
@@ -76,12 +76,12 @@ def _row(saving: str, whole: tuple[float, float], left: tuple[float, float]) -> 
     }
 
 
-def savings_text(rows: Sequence[Row]) -> list[str]:
+def savings_text(rows: Sequence[Row]) -> list[Part]:
     """Section of the report; none without rows."""
     if not rows:
         return []
     return [
         "## Savings",
         f"What scans of this flow can leave out, by dopri5 at tolerance {_TOLERANCE:g}:",
-        table(rows, _COLUMNS),
+        Table(rows, _COLUMNS),
     ]

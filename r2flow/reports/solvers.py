@@ -33,9 +33,10 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.inversion import metres_apart, rms
 from r2flow.reports.backbones import timed
-from r2flow.reports.pages import Page, Plot, lines_figure
+from r2flow.reports.figures import Plot, lines_figure
+from r2flow.reports.pages import Page
 from r2flow.reports.savings import savings_text
-from r2flow.reports.tables import Row, shown, table
+from r2flow.reports.tables import Part, Row, Table, shown
 
 USUAL = ("euler", "midpoint", "adams3", "dopri5")  # measured first
 METHODS = (*dict.fromkeys((*USUAL, "exprb43", *SOLVERS)), f"{TORCHDIFFEQ}dopri5")
@@ -256,7 +257,7 @@ def solvers_page(
 
     `saved` are rows of `r2flow.reports.savings`.
     """
-    text = []
+    text: list[Part] = []
     figures = {}
     groups = {name: list(group) for name, group in groupby(rows, itemgetter("problem"))}
     if subject is not None:
@@ -280,15 +281,16 @@ def solvers_page(
             "## Exact problems",
             f"{scans} scans each, in float64: the most accurate solver within a number of "
             "evaluations and its median RMS error; none if x_0 has a smaller error.",
-            table(lines, ["problem", *(f"within {budget}" for budget in budgets)]),
+            Table(lines, ["problem", *(f"within {budget}" for budget in budgets)]),
         ]
         plots = [_plot(name, group, "evaluations", "error") for name, group in groups.items()]
         figures["solvers_problems"] = lines_figure(plots, 4)
-    text += ["## All configurations", table(rows, _COLUMNS)]
-    return Page("solvers", "Solvers: error against run time", text, rows, figures, seeds, device)
+    title = "Solvers: error against run time"
+    every = [Table(rows, _COLUMNS, "All configurations")]
+    return Page("solvers", title, text, rows, figures, seeds, device, details=every)
 
 
-def flow_text(rows: Sequence[Row], subject: Subject) -> list[str]:
+def flow_text(rows: Sequence[Row], subject: Subject) -> list[Part]:
     """Recommended solvers per error on a trained flow."""
     plugins = [f"--plugin={name}" for name in loaded_plugins()]
     command = shlex.join(["r2flow", "sample", subject.name, *plugins])
@@ -303,7 +305,7 @@ def flow_text(rows: Sequence[Row], subject: Subject) -> list[str]:
         "above "
         f"{shown(subject.floor)} can be measured.",
         "Sampler with the fewest evaluations for an RMS error of the range:",
-        table(by_error, {"wanted": "error", "how": "sampler", **cost}),
+        Table(by_error, {"wanted": "error", "how": "sampler", **cost}),
     ]
 
 

@@ -1,15 +1,14 @@
-"""Tables in Markdown and in the terminal."""
+"""Tables in Markdown, in LaTeX and in the terminal."""
 
 import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Table as Grid
 from rich.text import Text
 
 from r2flow.base.errors import one_line
@@ -22,32 +21,45 @@ Columns = Mapping[str, str] | Sequence[str]
 _NUMBER = re.compile(r"[-+]?\d|-?$|none$|inf$")  # how cells of a right-aligned column begin
 
 
-def table(rows: Rows, columns: Columns) -> str:
-    """Format rows as a Markdown table, numbers with three digits."""
+class Table(NamedTuple):
+    """A table of a page."""
+
+    rows: Rows
+    columns: Columns
+    title: str = ""
+
+
+Part = str | Table  # of the text of a page
+
+
+def markdown(rows: Rows, columns: Columns, title: str = "") -> str:
+    """Format a table for Markdown, numbers with three digits."""
     lines = [[cell.replace("|", "\\|") for cell in line] for line in _as_text(rows, columns)]
     lines.insert(1, ["---"] * len(lines[0]))
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    heading = [f"## {title}\n"] if title else []
+    return "\n".join([*heading, *(f"| {' | '.join(line)} |" for line in lines)])
 
 
-def latex(rows: Rows, columns: Columns) -> str:
-    """Format rows as a LaTeX table of the package booktabs."""
+def latex(rows: Rows, columns: Columns, title: str = "") -> str:
+    """Format a table for LaTeX, of the package booktabs."""
     lines = [
         " & ".join(re.sub(r"([&%$#_{}])", r"\\\1", cell) for cell in line).replace("±", r"$\pm$")
         for line in _as_text(rows, columns)
     ]
+    heading = [f"% {title}"] if title else []
     head, *body = (rf"{line} \\" for line in lines)
-    kinds = "l" * len(columns)
-    parts = [rf"\begin{{tabular}}{{{kinds}}}", r"\toprule", head, r"\midrule", *body]
+    begin = rf"\begin{{tabular}}{{{'l' * len(columns)}}}"
+    parts = [*heading, begin, r"\toprule", head, r"\midrule", *body]
     return "\n".join([*parts, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
 def print_table(rows: Rows, columns: Columns, title: str = "") -> None:
-    """Print rows as a table: numbers right-aligned, no heading line if all headings are "".
+    """Print a table: numbers right-aligned, no heading line if all headings are "".
 
     A terminal's table has its width; elsewhere, as in a log, lines are as long as their cells.
     """
     lines = _as_text(rows, columns)
-    grid = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=any(lines[0]))
+    grid = Grid(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=any(lines[0]))
     for heading, *cells in zip(*lines, strict=True):
         numeric = all(map(_NUMBER.match, cells))
         grid.add_column(Text(heading), justify="right" if numeric else "left", overflow="fold")
@@ -62,16 +74,6 @@ def print_table(rows: Rows, columns: Columns, title: str = "") -> None:
         console.print(grid)
     for printed in captured.get().splitlines():
         print(printed.rstrip())
-
-
-def print_markdown(text: str) -> None:
-    """Print a text with tables of `table`, which `print_table` prints."""
-    for is_table, lines in groupby(text.splitlines(), lambda line: line.startswith("| ")):
-        if is_table:
-            cells = [[c.replace("\\|", "|") for c in line[2:-2].split(" | ")] for line in lines]
-            print_table(cells[2:], cells[0])
-        else:
-            print(*lines, sep="\n")
 
 
 def shown(value: Any) -> str:
@@ -89,7 +91,7 @@ def shown(value: Any) -> str:
     return f"{value:.1e}"
 
 
-def short_names(paths: Sequence[Path]) -> list[str]:
+def short_names(paths: Sequence[str | Path]) -> list[str]:
     """Names of files or folders, with as many parents as needed to be unique."""
     parts = [Path(os.path.abspath(path)).parts for path in paths]  # links keep their names
     depth = 1
@@ -100,8 +102,7 @@ def short_names(paths: Sequence[Path]) -> list[str]:
 
 def words(values: Mapping[str, Any]) -> str:
     """Format named values that are not None: 'cores 2, threads 1'."""
-    given = {key: value for key, value in values.items() if value is not None}
-    return ", ".join(f"{key} {shown(value)}" for key, value in given.items())
+    return ", ".join(f"{key} {shown(x)}" for key, x in values.items() if x is not None)
 
 
 def _as_text(rows: Rows, columns: Columns) -> list[list[str]]:

@@ -12,9 +12,8 @@ from numpy import ndarray
 
 from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.paths import checkpoints_of
+from r2flow.reports.figures import Plot, lines_figure, save_figure
 from r2flow.reports.outputs import what_next, write_samples
-from r2flow.reports.pages import Plot, lines_figure
-from r2flow.reports.pictures import save_figure
 
 Curve = tuple[ndarray, ndarray]
 

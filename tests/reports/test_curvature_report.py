@@ -8,6 +8,7 @@ from torch import nn
 
 from r2flow.base.noise import Draws
 from r2flow.reports.curvature import _curvature_rows, curvature_page, measure_paths, summary
+from r2flow.reports.tables import markdown
 from tests.conftest import SENSOR
 from tests.test_sampling import flow
 
@@ -63,7 +64,7 @@ def test_the_page_compares_the_flows():
     slopes = {"slow": 0.5, "fast": 4.0}
     flows = {name: measure_paths(flow(Falling(a)), name, 1, STEPS, 5) for name, a in slopes.items()}
     page = curvature_page(flows, 5)
-    said = " ".join(page.text)
+    said = markdown(*page.text[1])
     # s / |d|^2 does not change when a straight-line velocity is scaled; here the slower one is
     # nearer to v = c t, whose variance over squared mean is (1/12) / (1/4) = 1/3.
     assert 0.9 / 3 < summary("slow", flows["slow"])["integral_normalised"] < 1.2 / 3
@@ -79,7 +80,7 @@ def test_a_flow_that_goes_nowhere_has_no_normalised_integral():
     still = measure_paths(flow(Falling(0.0)), "still", 1, 4, 5)
     page = curvature_page({"still": still}, 5)
     assert math.isnan(summary("still", still)["integral_normalised"])
-    assert "| still | 0 | - |" in page.text[1]
+    assert "| still | 0 | - |" in markdown(*page.text[1])
 
 
 def test_a_flow_of_nan_is_said(caplog):

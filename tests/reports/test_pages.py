@@ -7,8 +7,9 @@ import pytest
 import torch
 
 import r2flow
-from r2flow.reports.pages import STYLES, Page, blank_figure, command, write_page
-from r2flow.reports.tables import print_markdown, print_table, shown, table
+from r2flow.reports.figures import STYLES, blank_figure
+from r2flow.reports.pages import Page, command, print_text, write_page
+from r2flow.reports.tables import Table, print_table, shown
 
 ROWS = [
     {"solver": "euler", "evaluations": 4, "error": 0.5},
@@ -20,7 +21,7 @@ def page(**changes) -> Page:
     figure = blank_figure(3, 2)
     figure.add_subplot().plot([0, 1], [0, 1], **STYLES[0])
     given = {
-        "name": "speed", "title": "How fast", "text": ["First.", table(ROWS, {"solver": "s|", "error": "RMS"})],
+        "name": "speed", "title": "How fast", "text": ["First.", Table(ROWS, {"solver": "s|", "error": "RMS"})], "details": ["Last.", Table(ROWS, {"solver": ""}, "All")],
         "rows": ROWS, "figures": {"speed": figure}, "seeds": {"scenes": 3},
     }  # fmt: skip
     return Page(**{**given, **changes})
@@ -62,7 +63,8 @@ def test_every_file_holds_the_rows_in_its_own_way(tmp_path):
     for words in (
         "# How fast\n\n![speed](speed.png)\n\nFirst.\n\n| s\\| |",
         "a\\|b\\nc | - |",
-        f"```\n{command()}\n",
+        "Last.\n\n## All\n\n|  |",
+        f"\n\n    {command()}\n\n",
     ):
         assert words in text
 
@@ -70,9 +72,10 @@ def test_every_file_holds_the_rows_in_its_own_way(tmp_path):
 def test_names_are_no_html_in_markdown_but_a_command_is_whole(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["/bin/r2flow", "report", "<b>"])
     rows = [{"solver": "<script>alert(1)</script>"}]
-    hostile = page(title="<img src=x>", text=[table(rows, {"solver": "<i>"})])
+    hostile = page(title="<img src=x>", text=[Table(rows, {"solver": "<i>"})])
     write_page(hostile, tmp_path)
-    before, command_line, after = (tmp_path / "speed.md").read_text().split("```")
+    text = (tmp_path / "speed.md").read_text()
+    before, command_line, after = re.split("\n\n    (.*)\n\n", text)
     assert "<" not in before + after
     assert "&lt;script>" in before
     assert "&lt;img" in before
@@ -130,7 +133,7 @@ def test_a_long_value_cuts_no_key_and_pads_no_line(capsys):
 
 
 @pytest.mark.parametrize(
-    "draw", [print_table, lambda rows, columns: print_markdown(table(rows, columns))]
+    "draw", [print_table, lambda rows, columns: print_text([Table(rows, columns)])]
 )
 def test_a_terminal_shows_wide_tables_in_its_width(capsys, monkeypatch, draw):
     monkeypatch.setenv("FORCE_COLOR", "1")  # counts as a terminal

@@ -16,6 +16,7 @@ from r2flow.reports.paper import (
     _table_i,
     role_of,
 )
+from r2flow.reports.tables import markdown
 from tests.conftest import CONFIG, write_run
 from tests.test_sampling import network
 
@@ -69,7 +70,7 @@ def test_an_evaluated_row_stands_below_the_printed_row_of_its_evaluations_and_a_
     ]
     lines = [
         [cell.strip() for cell in line.strip("|").split("|")]
-        for line in _table_i(rows).splitlines()[2:]
+        for line in markdown(*_table_i(rows)[:2]).splitlines()[2:]
     ]
     below = {tuple(a[:3]): b for a, b in itertools.pairwise(lines) if b[1] == "ours"}
     jsd = 3 + list(COLUMNS).index("jsd")

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from r2flow.lidar.sensors import SENSORS
-from r2flow.reports.pictures import STREET, contact_sheet, figure_pixels, save_figure, scan_figure
+from r2flow.reports.figures import figure_pixels, save_figure
+from r2flow.reports.pictures import STREET, contact_sheet, scan_figure, trust_ids
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
 E, A = SENSOR.rays().numpy()
@@ -29,11 +30,30 @@ def test_extreme_scans_are_drawn(tmp_path, r):
         assert save_figure(figure, tmp_path / "scan.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_unmeasured_rays_are_grey_in_the_first_scan_alone():
+def test_unmeasured_rays_are_white_in_the_first_scan_alone():
     scan, hidden = image(np.full_like(E, 10.0)), E > 0
     figure = contact_sheet([scan[:1], scan], SENSOR.rays(), ["known", "answer"], hidden)
-    (grey,) = [axes.images[1].get_array()[..., 3] for axes in figure.axes if len(axes.images) == 2]
-    assert np.array_equal(grey, hidden)
+    (white,) = [axes.images[1].get_array() for axes in figure.axes if len(axes.images) == 2]
+    assert np.array_equal(white[..., 3], hidden)
+    assert (white[hidden] == 1).all()
+
+
+def test_no_two_legends_of_a_completed_scan_give_a_colour_two_meanings():
+    scan, added = image(np.full_like(E, 10.0)), E > 0
+    ids = trust_ids(scan, np.where(added, np.linspace(0.01, 2, 64), 0.0))
+    figure = contact_sheet([scan, scan], SENSOR.rays(), (), added, [None, ids])
+    meanings = {
+        (patch.get_facecolor(), patch.get_label())
+        for axes in figure.axes
+        if axes.get_legend()
+        for patch in axes.get_legend().legend_handles
+    }
+    names = {name for _, name in meanings}
+    assert names == {"not measured", "measured, no return", "no return", "measured",
+                     "added, up to 0.05 m", "up to 0.2 m", "up to 1 m", "more"}  # fmt: skip
+    assert len({colour for colour, _ in meanings}) == len(names) - 1  # black: no return
+    titles = [axes.get_title("left") for axes in figure.axes]
+    assert titles.count("predicted error (68 %)") == 1  # of the second scan alone
 
 
 def test_classes_of_labelled_scans_have_a_strip_and_a_legend():

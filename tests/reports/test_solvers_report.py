@@ -25,6 +25,7 @@ from r2flow.reports.solvers import (
     problem_subjects,
     solvers_page,
 )
+from r2flow.reports.tables import markdown
 from tests.conftest import CONFIG
 from tests.fields import Field
 from tests.test_sampling import GaussianFlow
@@ -103,7 +104,9 @@ def test_the_exact_problems_are_reported_with_what_was_not_solved():
     straight = {r["label"]: r for r in rows if r["problem"] == "straight"}
     assert straight["euler, 4 steps"]["error"] < 1e-12
     page = solvers_page(rows, None, [4, 8], {})
-    assert "| stiff_1e4 | none |" in page.text[2]  # explicit steps of 1/4 end farther than x_0
+    assert "| stiff_1e4 | none |" in markdown(
+        *page.text[2]
+    )  # explicit steps of 1/4 end farther than x_0
     assert set(page.figures) == {"solvers_problems"}
     axes = page.figures["solvers_problems"].axes[0]
     # larger ones overlap

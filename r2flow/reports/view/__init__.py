@@ -26,7 +26,7 @@ from torch import Tensor
 from r2flow.base.errors import InputError, printable
 from r2flow.base.files import write_file
 from r2flow.lidar.labels import semantic_ids
-from r2flow.reports.pictures import TRUST, class_colours, colours, view_of
+from r2flow.reports.pictures import TRUST, TRUST_TITLE, class_colours, colours, view_of
 
 MOST = 256 * 64 * 1024  # maximum pixels of all images of a page: about 33 MB
 STEP = 0.004  # metres per range code: uint16 reaches 262 m with errors of at most 2 mm
@@ -124,6 +124,7 @@ def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
                 "labels": panel.labels is not None,
             }
         )
+    trusted = classes.keys() & TRUST.keys()
     view = view_of(*((panel.images[0], panel.rays) for panel in panels))
     return {
         "scans": scans,
@@ -133,8 +134,8 @@ def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
         "ranges": view.ranges,
         "heights": view.heights,
         "colours": colour_table(),
-        "classes": [("no class", "#808080"), *classes.values()],
-        "kind": "error" if classes.keys() & TRUST.keys() else "label",
+        "classes": [("none predicted" if trusted else "no class", "#808080"), *classes.values()],
+        "kind": TRUST_TITLE if trusted else "label",
         "legend": list(dict(classes.values()).items()),
         "shown": {
             "reflectance": any(scan["reflectance"] for scan in scans),

@@ -708,7 +708,8 @@ function setMode(mode) {
   legend.replaceChildren();
   const say = (text) => node("span", legend, { textContent: text });
   if (mode === "label") {
-    const others = page.kind === "label" ? [page.classes[0]] : [];
+    const some = page.kind === "label" || page.scans.some((scan) => !scan.labels);
+    const others = some ? [page.classes[0]] : [];
     for (const [name, colour] of [...page.legend, ...others]) {
       const entry = say("");
       node("b", entry).style.background = colour;
