@@ -149,17 +149,18 @@ class Generator(nn.Module):
             raise InputError(
                 f"this {type(self).__name__} takes no condition; complete scans by --sampler mmps."
             )
-        if draws is None and how.draws:
-            raise InputError(f"sampler {how.name} is stochastic: give draws.")
         dtype = next(self.parameters(), noise).dtype  # float64 for weights of 64-true runs
         if hasattr(self, "velocity"):  # a solver's state may have more digits than its network
             dtype = torch.promote_types(noise.dtype, dtype)
         x = wide(noise.to(self.device, dtype))
         if condition is not None:
             condition = {name: value.to(self.device) for name, value in condition.items()}
-        noise_of_step = None
-        if draws is not None:
-            noise_of_step = lambda j: self.further_noise(draws, j).to(x)  # noqa: E731
+
+        def noise_of_step(j: int) -> Tensor:
+            if draws is None:
+                raise InputError(f"sampler {how.name} is stochastic: give draws.")
+            return self.further_noise(draws, j).to(x)
+
         with autocast(self.device, precision):
             return how(self, x, condition, noise_of_step, progress or (lambda: None))
 

@@ -164,19 +164,16 @@ def _walls(s: Returns) -> tuple[ndarray, ndarray, ndarray]:
 
 def poles(s: Returns) -> ndarray:
     """Horizontal positions, (P, 2)."""
-    before = np.argsort(s.after)
-    joined = _near(s, s.after, _POLE_WIDTH)
-    gap = (s.column[s.after] - s.column) % s.sensor.columns
-    aside = gap * np.minimum(s.bins, s.bins[s.after]) >= _POLE_CLEARANCE
-    free_after = aside | (s.far[s.after] > s.far + _POLE_CLEARANCE)
-    free_before = (aside | (s.far > s.far[s.after] + _POLE_CLEARANCE))[before]
-    # Runs of joined returns: a closed ring has no ends, all others have two.
-    run = _components(len(s.p), np.flatnonzero(joined), s.after[joined])
-    first = np.flatnonzero(~joined[before])
-    last = np.flatnonzero(~joined)
-    first = first[np.argsort(run[first])]
-    last = last[np.argsort(run[last])]
-    thin = s.stands[first] & free_before[first] & free_after[last] & (s.far[first] <= _REACH)
+    # Ends of runs of near returns, and the starts of the next runs; a closed ring has none.
+    last = np.flatnonzero(~_near(s, s.after, _POLE_WIDTH))
+    first = s.after[last]
+    gap = (s.column[first] - s.column[last]) % s.sensor.columns
+    aside = gap * np.minimum(s.bins[first], s.bins[last]) >= _POLE_CLEARANCE
+    free_after = aside | (s.far[first] > s.far[last] + _POLE_CLEARANCE)
+    thin = aside | (s.far[last] > s.far[first] + _POLE_CLEARANCE)
+    following = _after(s.row[last])
+    last = last[following]
+    thin &= s.stands[first] & free_after[following] & (s.far[first] <= _REACH)
     thin &= np.abs(s.z[last] - s.z[first]) < _POLE_WIDTH
     first = first[thin]
     last = last[thin]

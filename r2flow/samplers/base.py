@@ -15,12 +15,11 @@ from r2flow.flow.solvers.solution import finite, wide
 
 Condition = Mapping[str, Tensor]
 """Conditions of each scan by name: tensors of shape (B, ...)."""
+Known = Condition | None  # None: nothing is known of the scans
 
-Call = Callable[[], None]
-Progress = Call | None
+Tick = Callable[[], None]  # called after every network evaluation
+Progress = Tick | None
 Noise = Callable[[int], Tensor]  # the j-th draw from N(0, 1), j = 1, 2, ..., in the noise's shape
-Given = Condition | None
-Fresh = Noise | None
 Steps = Annotated[int, Bound("from 1 to 1,000,000", lambda n: 1 <= n <= 10**6)]
 Grid = str | list[float] | tuple[float, ...]
 
@@ -41,7 +40,7 @@ class Generated:
         return cls(wide(x), counted, finite(x) if converged is None else converged)
 
 
-def last_of(states: Iterable[Tensor], progress: Call) -> Tensor:
+def last_of(states: Iterable[Tensor], progress: Tick) -> Tensor:
     """Iterate over a sampler's states, calling `progress` after each; return the last one."""
     for state in states:
         progress()
@@ -62,15 +61,14 @@ class Sampler(ABC):
 
     @abstractmethod
     def __call__(
-        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+        self, generator: Any, noise: Tensor, condition: Known, draws: Noise, progress: Tick
     ) -> Generated:
         """Generate x_1 in model space, (B, C, H, W).
 
         Args:
             generator: A generator with the attribute `needs`.
             noise: (B, *noise_shape), on the generator's device, float32 or float64.
-            draws: Noise of step j; required if `self.draws`.
-            progress: Called after every network evaluation.
+            draws: Noise of step j.
         """
 
     @property
@@ -106,12 +104,12 @@ class Sampler(ABC):
         """A copy with the options that are not None."""
         from r2flow.samplers import build_sampler
 
-        given = self.asdict()
+        fields = self.asdict()
         options = _plain(options)
-        times = isinstance(given.get("grid"), list)
-        if times and options.get("steps", given["steps"]) != given["steps"]:
-            del given["grid"]  # its times are of another number of steps
-        return build_sampler(given | options)
+        times = isinstance(fields.get("grid"), list)
+        if times and options.get("steps", fields["steps"]) != fields["steps"]:
+            del fields["grid"]  # its times are of another number of steps
+        return build_sampler(fields | options)
 
     def asdict(self) -> Config:
         """Name and fields as plain values, as stored in a config or a checkpoint."""
@@ -124,8 +122,8 @@ class Sampler(ABC):
     @property
     def text(self) -> str:
         """`NAME:FIELD=VALUE:...`, as `parse_sampler` reads it."""
-        _, *given = [f"{key}={value}" for key, value in self.asdict().items() if value is not None]
-        return ":".join([self.name, *given])
+        _, *fields = [f"{key}={value}" for key, value in self.asdict().items() if value is not None]
+        return ":".join([self.name, *fields])
 
     def __str__(self) -> str:
         steps = getattr(self, "steps", None)

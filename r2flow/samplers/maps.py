@@ -12,7 +12,7 @@ from r2flow.flow.maps import MeanVelocity, jump
 from r2flow.flow.solvers import solve
 from r2flow.flow.solvers.fixed import build_grid
 from r2flow.flow.solvers.solution import finite, stepped
-from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, OnGrid, Sampler, Steps
+from r2flow.samplers.base import Generated, Grid, Known, Noise, OnGrid, Sampler, Steps, Tick
 
 
 @dataclass(frozen=True)
@@ -28,20 +28,20 @@ class Jump(OnGrid):
         return jump(u, t, x, s)
 
     def start(
-        self, generator: Any, noise: Tensor, condition: Given, progress: Call
+        self, generator: Any, noise: Tensor, condition: Known, progress: Tick
     ) -> tuple[int, Tensor, Tensor]:
         """Number of steps before the first jump, the state after them, and whether it is finite."""
         return 0, noise, finite(noise)
 
     def __call__(
-        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+        self, generator: Any, noise: Tensor, condition: Known, draws: Noise, progress: Tick
     ) -> Generated:
         first, x, alive = self.start(generator, noise, condition, progress)
         u = generator.map(condition)
         times = self.times().to(noise)[first:]
         for j, (t, s) in enumerate(pairwise(times), start=1):
             last = j == len(times) - 1
-            e = draws(j) if self.draws and draws and not last else x.new_zeros(())
+            e = draws(j) if self.draws and not last else x.new_zeros(())
             x, alive = stepped(x, self.step(u, t, x, s, e), alive)
             progress()
         return Generated.after(x, self.steps, alive)
@@ -93,7 +93,7 @@ class Refine(Renoise):
         return torch.cat([leading, _late(self.steps - self.leading, 1 - self.until)[1:]])
 
     def start(
-        self, generator: Any, noise: Tensor, condition: Given, progress: Call
+        self, generator: Any, noise: Tensor, condition: Known, progress: Tick
     ) -> tuple[int, Tensor, Tensor]:
         if not self.leading:
             return super().start(generator, noise, condition, progress)
@@ -122,7 +122,7 @@ class Transport(Sampler):
         return 1
 
     def __call__(
-        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+        self, generator: Any, noise: Tensor, condition: Known, draws: Noise, progress: Tick
     ) -> Generated:
         x = generator.transported(noise, condition, self.residual)
         progress()

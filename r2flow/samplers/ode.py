@@ -9,7 +9,7 @@ from torch import Tensor
 from r2flow.base.errors import InputError
 from r2flow.base.registry import Config, Count, Portion, Positive
 from r2flow.flow.solvers import SOLVERS, TORCHDIFFEQ, method_of, solve
-from r2flow.samplers.base import Call, Fresh, Generated, Given, OnGrid, Sampler
+from r2flow.samplers.base import Generated, Known, Noise, OnGrid, Sampler, Tick
 
 
 class ODESampler(Sampler):
@@ -28,7 +28,7 @@ class ODESampler(Sampler):
             )
 
     def __call__(
-        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+        self, generator: Any, noise: Tensor, condition: Known, draws: Noise, progress: Tick
     ) -> Generated:
         end = solve(generator.field(condition), noise, progress=progress, **self.options())
         return Generated(end.x, end.evaluations, end.converged)
@@ -60,7 +60,7 @@ class FixedSteps(OnGrid, ODESampler):
         return {"method": self.method, "steps": self.steps, "grid": self.grid}
 
     def __call__(
-        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+        self, generator: Any, noise: Tensor, condition: Known, draws: Noise, progress: Tick
     ) -> Generated:
         if not self._finishes:
             return super().__call__(generator, noise, condition, draws, progress)

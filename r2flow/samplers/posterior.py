@@ -16,7 +16,7 @@ from torch import Tensor
 from r2flow.base.errors import InputError
 from r2flow.base.registry import Count, NonNegative
 from r2flow.flow.maps import MeanVelocity, jump
-from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, Noise, OnGrid, Steps
+from r2flow.samplers.base import Generated, Grid, Known, Noise, OnGrid, Steps, Tick
 from r2flow.samplers.stochastic import SDE, back, sde
 
 # Largest growth of |y - A x_1hat|^2 in conjugate gradients: a larger residual has diverged.
@@ -51,7 +51,7 @@ class Posterior(OnGrid):
             )
 
     def __call__(
-        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+        self, generator: Any, noise: Tensor, condition: Known, draws: Noise, progress: Tick
     ) -> Generated:
         if condition is None:
             raise InputError(
@@ -63,7 +63,7 @@ class Posterior(OnGrid):
         return Generated.after(torch.where(known, y, x), self.evaluations())
 
     def answer(
-        self, generator: Any, x_0: Tensor, y: Tensor, known: Tensor, noise: Fresh, progress: Call
+        self, generator: Any, x_0: Tensor, y: Tensor, known: Tensor, noise: Noise, progress: Tick
     ) -> Tensor:
         """x_1 of a generator given y where `known`, (B, ...)."""
 
@@ -134,7 +134,7 @@ class Repaint(Posterior):
         return x
 
     def answer(
-        self, generator: Any, x_0: Tensor, y: Tensor, known: Tensor, noise: Fresh, progress: Call
+        self, generator: Any, x_0: Tensor, y: Tensor, known: Tensor, noise: Noise, progress: Tick
     ) -> Tensor:
         if hasattr(generator, "repaint"):
             return generator.repaint(self, x_0, y, known, noise, progress)

@@ -23,7 +23,7 @@ from torch import Tensor
 from r2flow.base.registry import NonNegative, Portion
 from r2flow.flow.solvers.fixed import build_grid
 from r2flow.flow.solvers.solution import finite, stepped
-from r2flow.samplers.base import Call, Fresh, Generated, Given, Grid, Noise, OnGrid
+from r2flow.samplers.base import Generated, Grid, Known, Noise, OnGrid, Tick
 
 _Estimate = Callable[[Tensor, Tensor], Tensor]  # x_1hat(t, x_t) with t of shape ()
 
@@ -68,9 +68,7 @@ def sde_step(t: float, s: float, c: float, t_b: float | None = None) -> Step:
     return Step((1 - s) / (1 - t) * kept, now, before, (1 - s) * math.sqrt(1 - kept**2))
 
 
-def sde(
-    estimate: _Estimate, x: Tensor, times: Tensor, c: float, noise: Noise | None
-) -> Iterator[Tensor]:
+def sde(estimate: _Estimate, x: Tensor, times: Tensor, c: float, noise: Noise) -> Iterator[Tensor]:
     """Yield the state after each step, (B, ...); the last one is x_1. One estimate per step.
 
     Order 2 in distribution if x_1hat is linear in x. `times` increase from 0 to 1, (N + 1,)
@@ -84,7 +82,6 @@ def sde(
         if previous is not None and step.before:
             x = x + step.before * previous[1]
         if step.fresh:  # c > 0
-            assert noise is not None
             x = x + step.fresh * noise(j)
         previous = t, x_1
         yield x
@@ -115,7 +112,7 @@ class SDE(OnGrid):
         return self.churn > 0
 
     def __call__(
-        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+        self, generator: Any, noise: Tensor, condition: Known, draws: Noise, progress: Tick
     ) -> Generated:
         field = generator.field(condition)
         x = noise

@@ -250,10 +250,11 @@ def test_augmentation_is_the_published_one(shared: Path, number: int):
     case = load_case(shared, "ada_transforms.pt")["cases"][number]
     names = [name for name in (*TRANSFORMATIONS, "hue", "saturation") if case["policy"].get(name)]
     drawn = [tensor.float() for _, tensor in case["draws"]]
-    given = zip(names, zip(drawn[::2], drawn[1::2], strict=True), strict=True)
     x = case["x"].clone().requires_grad_()
-    none = torch.zeros(len(x))
-    draws = dict.fromkeys(TRANSFORMATIONS, (none, none)) | dict(given)
+    draws = {name: torch.full((len(x),), one.identity) for name, one in TRANSFORMATIONS.items()}
+    for name, value, applies in zip(names, drawn[::2], drawn[1::2], strict=True):
+        if name in TRANSFORMATIONS:
+            draws[name] = torch.where(applies > 0, value, TRANSFORMATIONS[name].identity)
     scale, shift = affine(draws, *x.shape[-2:])
     maps = torch.diag_embed(torch.cat([scale.flip(0), torch.ones(1, len(x))]).T)
     maps[:, :2, 2] = shift.flip(0).T  # the published maps have columns before rows
@@ -269,22 +270,29 @@ def draws_of(count: int) -> BatchDraws:
 
 
 def test_augmentation_draws_the_published_distributions():
-    draws = AdaptiveAugment(initial=0.4).draw(draws_of(20_000))
+    draws = AdaptiveAugment(initial=1.0).draw(draws_of(20_000))
     assert list(draws) == list(TRANSFORMATIONS)
-    for name, draw in draws.items():
-        assert draw[1].mean().item() == pytest.approx(0.4, abs=0.015), name
+    for name, draw in AdaptiveAugment(initial=0.4).draw(draws_of(20_000)).items():
+        applied = draw == draws[name]
+        assert (applied | (draw == TRANSFORMATIONS[name].identity)).all()
+        share = (
+            (applied.float().mean().item() - 0.5) * 2
+            if "flip" in name
+            else applied.float().mean().item()
+        )
+        assert share == pytest.approx(0.4, abs=0.015), name
     for name, mean, deviation in (
         ("lr_flip", 0.5, 0.5), ("int_trans", 0.0, 0.25 / 12**0.5), ("frac_trans", 0.0, 0.125), ("brightness", 0.0, 0.2),
         ("luma_flip", 0.5, 0.5),
     ):  # fmt: skip
-        values = draws[name][0]
+        values = draws[name]
         assert values.mean().item() == pytest.approx(
             mean, abs=5 * deviation / len(values.flatten()) ** 0.5
         ), name
         assert values.std().item() == pytest.approx(deviation, rel=0.03), name
     for name, octaves in (("iso_scale", 0.2), ("contrast", 0.5)):
-        assert draws[name][0].log2().std().item() == pytest.approx(octaves, rel=0.03), name
-    assert draws["int_trans"][0].shape == draws["frac_trans"][0].shape == (2, 20_000)
+        assert draws[name].log2().std().item() == pytest.approx(octaves, rel=0.03), name
+    assert draws["int_trans"].shape == draws["frac_trans"].shape == (2, 20_000)
 
 
 def test_augmentation_of_probability_0_keeps_the_image():

@@ -32,10 +32,7 @@ from r2flow.metrics.scans import Scans
 
 _VOXEL = 0.05  # metres
 _SECTORS = 16
-_NEAR = (
-    4.0  # metres: evenly spaced edges of distance sectors from _NEAR to _FAR, except the first, 0
-)
-_FAR = 56.0
+_ENDS = 4.0, 56.0  # metres: evenly spaced edges of distance sectors, except the first, 0
 _WIDTHS = (16, 16, 32, 64, 128, 128, 64, 48, 48)  # stem, four levels down, four up
 
 
@@ -61,7 +58,7 @@ def _mean_by_distance(features: Tensor, coords: Tensor) -> Tensor:
     Features are (M, C), means (16 C,), C fastest. Voxels 56 m or more from the centroid are
     ignored; an empty sector has the mean 0.
     """
-    ends = torch.linspace(_NEAR, _FAR, _SECTORS + 1, device=coords.device)[1:]
+    ends = torch.linspace(*_ENDS, _SECTORS + 1, device=coords.device)[1:]
     position = coords.float()
     distance = (position - position.mean(0)).norm(dim=1) * _VOXEL
     sector = torch.bucketize(distance, ends, right=True)  # _SECTORS beyond the last end
@@ -138,10 +135,8 @@ class MinkowskiNet(Extractor):
         y = maps[4]
         for level in range(1, 5):
             if self.has_points and level in (1, 3):
-                corners = _Corners(coords, y.grid, 2 ** (5 - level))
                 transformed = self.point_transforms[level // 2](points)
-                points = corners._to_points(y.features) + transformed
-                y = y._replace(features=corners._to_voxels(points))
+                points, y = _exchange(transformed, coords, y, 2 ** (5 - level))
             y = self.get_submodule(f"up{level}.0")(y)
             both = torch.cat([y.features, maps[4 - level].features], 1)
             y = self.get_submodule(f"up{level}.1")(y._replace(features=both))
@@ -188,30 +183,23 @@ class SPVCNN(MinkowskiNet):
     has_points = True
 
 
-class _Corners:
-    """Points at `coords` (N, 3) int64 in a grid of voxels that are `scale` times as large."""
+def _exchange(points: Tensor, coords: Tensor, voxels: Sparse, scale: int) -> tuple[Tensor, Sparse]:
+    """Add voxel features at the points to those of points, and average the sums per voxel.
 
-    def __init__(self, coords: Tensor, grid: VoxelGrid, scale: int) -> None:
-        around = coords // scale
-        share = (coords % scale)[:, None] / scale  # relative position within the voxel
-        self.num = len(grid)
-        self.voxels = grid.find(around)
-        corners = coords.new_tensor(offsets(2))  # (8, 3)
-        self.corners = grid.find(around[:, None] + corners)
-        weights = torch.where(corners > 0, share, 1 - share).prod(2) * (self.corners >= 0)
-        self.weights = weights / (weights.sum(1, keepdim=True) + 1e-8)
-
-    def _to_points(self, features: Tensor) -> Tensor:
-        """Interpolate voxel features (M, C) at the points: (N, C).
-
-        Over the existing ones of eight corners.
-        """
-        corners = self.corners.clamp(min=0)
-        weights = self.weights.to(features)
-        return F.embedding_bag(corners, features, mode="sum", per_sample_weights=weights)
-
-    def _to_voxels(self, features: Tensor) -> Tensor:
-        """Average point features (N, C) per voxel: (M, C)."""
-        total = features.new_zeros(self.num, features.shape[1])
-        total.index_add_(0, self.voxels, features)
-        return total / torch.bincount(self.voxels, minlength=self.num)[:, None]
+    Points at `coords` (N, 3) int64 have features (N, C); voxels are `scale` times as large. Voxel
+    features are interpolated over the existing ones of eight corners.
+    """
+    grid = voxels.grid
+    home = coords // scale
+    share = (coords % scale)[:, None] / scale  # relative position within the voxel
+    steps = coords.new_tensor(offsets(2))  # (8, 3)
+    corners = grid.find(home[:, None] + steps)
+    weights = torch.where(steps > 0, share, 1 - share).prod(2) * (corners >= 0)
+    weights = (weights / (weights.sum(1, keepdim=True) + 1e-8)).to(points)
+    points = points + F.embedding_bag(
+        corners.clamp(min=0), voxels.features, mode="sum", per_sample_weights=weights
+    )
+    index = grid.find(home)
+    total = points.new_zeros(len(grid), points.shape[1]).index_add_(0, index, points)
+    count = torch.bincount(index, minlength=len(grid))
+    return points, Sparse(total / count[:, None], grid)

@@ -12,14 +12,13 @@ from r2flow.generators.flow import NetworkFlow
 from r2flow.lidar.encoding import ModelSpace
 from r2flow.samplers import MMPS, Repaint
 from r2flow.samplers.base import (
-    Call,
     Condition,
-    Fresh,
     Generated,
-    Given,
+    Known,
     Noise,
     OnGrid,
     Steps,
+    Tick,
     last_of,
 )
 from r2flow.systems.diffusion.process import (
@@ -109,7 +108,7 @@ class Diffusion(NetworkFlow):
         image: Tensor,
         known: Tensor,
         noise: Noise,
-        progress: Call,
+        progress: Tick,
     ) -> Tensor:
         """Sample x_1 from noise z given the known part of an image, by the published RePaint."""
 
@@ -137,7 +136,7 @@ class DDIM(OnGrid):
         return self.eta > 0
 
     def __call__(
-        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+        self, generator: Any, noise: Tensor, condition: Known, draws: Noise, progress: Tick
     ) -> Generated:
         log_snrs = generator.log_snrs(self, noise)
         z = last_of(walk(generator.denoise, noise, log_snrs, self.eta, draws), progress)

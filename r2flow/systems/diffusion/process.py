@@ -126,7 +126,7 @@ def walk(
     z: Tensor,
     log_snrs: Tensor,
     eta: float,
-    noise: Noise | None,
+    noise: Noise,
     times: Tensor | None = None,
 ) -> Iterator[Tensor]:
     """Yield the states from noise z, (B, ...), to data, after each of N steps.
@@ -134,12 +134,12 @@ def walk(
     Args:
         log_snrs: Rising log-SNRs, (N + 1,).
         eta: See `step`.
-        noise: Called with 1, 2, ..., also in the last step; None if eta = 0.
+        noise: Called with 1, 2, ..., also in the last step, unless eta = 0.
         times: Those of `denoise`, (N,); None: the log-SNRs.
     """
     times = log_snrs[:-1] if times is None else times
     for j, t in enumerate(times, start=1):
-        fresh = noise(j) if eta and noise else None
+        fresh = noise(j) if eta else None
         z = step(z, denoise(z, t), log_snrs[j - 1], log_snrs[j], eta, fresh)
         yield z
 

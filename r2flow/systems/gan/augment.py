@@ -6,6 +6,7 @@ and generated. p adapts to the discriminator's scores of real images.
 """
 
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -42,31 +43,31 @@ class BatchDraws:
         return torch.tensor(np.stack(draws))
 
 
-Draws = Mapping[str, tuple[Tensor, Tensor]]
-"""By name: magnitudes, (B,) or (2, B) for rows and columns, and whether they apply, (B,) 0/1."""
+Magnitudes = Mapping[str, Tensor]
+"""Of each transformation, (B,), or (2, B) for rows and columns; its identity if it is left out."""
 
 
-def _flip(source: BatchDraws) -> Tensor:
-    return (source.uniform() < 0.5).float()
+class Transformation(NamedTuple):
+    """How magnitudes are drawn for a batch, and that of the identity."""
+
+    draw: Callable[[BatchDraws], Tensor]
+    identity: float = 0.0
 
 
-_Magnitudes = dict[str, Callable[[BatchDraws], Tensor]]
+_FLIP = Transformation(lambda source: (source.uniform() < 0.5).float())
 
-# Magnitudes for a batch, in the order of drawing and application.
-_GEOMETRY: _Magnitudes = {
-    "lr_flip": _flip,
-    "ud_flip": _flip,
-    "int_trans": lambda source: (source.uniform(2).mT - 0.5) / 4,  # relative to the size
-    "iso_scale": lambda source: torch.exp2(0.2 * source.normal()),
-    "frac_trans": lambda source: 0.125 * source.normal(2).mT,
+# In the order of drawing and application; shifts are relative to the size. The published hue and
+# saturation do not affect images of one or two channels.
+TRANSFORMATIONS = {
+    "lr_flip": _FLIP,
+    "ud_flip": _FLIP,
+    "int_trans": Transformation(lambda source: (source.uniform(2).mT - 0.5) / 4),
+    "iso_scale": Transformation(lambda source: torch.exp2(0.2 * source.normal()), 1.0),
+    "frac_trans": Transformation(lambda source: 0.125 * source.normal(2).mT),
+    "brightness": Transformation(lambda source: 0.2 * source.normal()),
+    "contrast": Transformation(lambda source: torch.exp2(0.5 * source.normal()), 1.0),
+    "luma_flip": _FLIP,
 }
-# The published hue and saturation do not affect images of one or two channels.
-_COLOUR: _Magnitudes = {
-    "brightness": lambda source: 0.2 * source.normal(),
-    "contrast": lambda source: torch.exp2(0.5 * source.normal()),
-    "luma_flip": _flip,
-}
-TRANSFORMATIONS = _GEOMETRY | _COLOUR
 
 
 class AdaptiveAugment(nn.Module):
@@ -116,40 +117,34 @@ class AdaptiveAugment(nn.Module):
         self.n_pred_cum.zero_()
         return sign
 
-    def draw(self, source: BatchDraws) -> Draws:
-        """Draw a batch's transformations by name; the number of draws does not depend on p."""
-        draws = {}
+    def draw(self, source: BatchDraws) -> Magnitudes:
+        """Draw a batch's transformations; the number of draws does not depend on p."""
         p = float(self.p)
-        for name, magnitudes in TRANSFORMATIONS.items():
-            value = magnitudes(source)
-            draws[name] = (value, (source.uniform() < p).float())
-        return draws
+        magnitudes = {}
+        for name, transformation in TRANSFORMATIONS.items():
+            value = transformation.draw(source)
+            applies = source.uniform() < p
+            magnitudes[name] = torch.where(applies, value, transformation.identity)
+        return magnitudes
 
-    def forward(self, x: Tensor, draws: Draws) -> Tensor:
+    def forward(self, x: Tensor, by: Magnitudes) -> Tensor:
         """Transform x (B, C, H, W) in at least float32; twice differentiable."""
         with torch.autocast(x.device.type, enabled=False):
-            maps = (part.to(x.device) for part in affine(draws, *x.shape[2:]))
-            return _coloured(transformed(at_least_float32(x), *maps), draws)
+            maps = (part.to(x.device) for part in affine(by, *x.shape[2:]))
+            return _coloured(transformed(at_least_float32(x), *maps), by)
 
 
-def _applied(draws: Draws, name: str, identity: float) -> Tensor:
-    """Magnitudes of a transformation, and that of the identity where it does not apply."""
-    value, chosen = draws[name]
-    return torch.where(chosen > 0, value, identity)
+def affine(by: Magnitudes, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Scale and shift of pixels about the image centre, (2, B) each, rows before columns.
 
-
-def affine(draws: Draws, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Scale and shift of pixels about the image centre by all of `_GEOMETRY`, (2, B) each.
-
-    Rows are before columns. Only rows are scaled, since a scale of columns would open the ring.
+    Only rows are scaled, since a scale of columns would open the ring.
     """
-    rows = _applied(draws, "iso_scale", 1.0)
+    rows = by["iso_scale"]
     zoom = torch.stack([rows, torch.ones_like(rows)])
-    flips = [_applied(draws, name, 0.0) for name in ("ud_flip", "lr_flip")]
+    flips = torch.stack([by["ud_flip"], by["lr_flip"]])
     size = torch.tensor([[height], [width]], device=rows.device)
-    whole = (_applied(draws, "int_trans", 0.0) * size).round()
-    shift = zoom * whole + _applied(draws, "frac_trans", 0.0) * size
-    return zoom * (1 - 2 * torch.stack(flips)), shift
+    shift = zoom * (by["int_trans"] * size).round() + by["frac_trans"] * size
+    return zoom * (1 - 2 * flips), shift
 
 
 def transformed(x: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
@@ -193,11 +188,10 @@ def _row(lines: Tensor, index: Tensor) -> Tensor:
     return lines[nearest] * (index == nearest)[..., None].to(lines)
 
 
-def _coloured(x: Tensor, draws: Draws) -> Tensor:
-    """Apply all of `_COLOUR` to x of one channel; two are left alone, as in the published code."""
+def _coloured(x: Tensor, by: Magnitudes) -> Tensor:
+    """Change the values of one channel; two are left alone, as in the published code."""
     if x.shape[1] != 1:
         return x
-    identities = {"brightness": 0.0, "contrast": 1.0, "luma_flip": 0.0}
-    values = [_applied(draws, name, identity) for name, identity in identities.items()]
-    brightness, contrast, flip = torch.stack(values).to(x)[..., None, None, None]
+    values = torch.stack([by["brightness"], by["contrast"], by["luma_flip"]])
+    brightness, contrast, flip = values.to(x)[..., None, None, None]
     return (x + brightness) * contrast * (1 - 2 * flip)

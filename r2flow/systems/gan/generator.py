@@ -11,7 +11,7 @@ from r2flow.base.registry import Bound
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.base import Generator
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler
+from r2flow.samplers.base import Generated, Known, Noise, Sampler, Tick
 from r2flow.systems.gan.layers import LatentGenerator, Outputs
 
 
@@ -54,11 +54,10 @@ class Direct(Sampler):
         return 1
 
     def __call__(
-        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+        self, generator: Any, noise: Tensor, condition: Known, draws: Noise, progress: Tick
     ) -> Generated:
         uniform = None
         if generator.drops:
-            assert draws is not None
             uniform = torch.special.ndtr(draws(1).double()).to(noise)
         x = generator.made(noise, uniform, truncation=self.truncation)["image"]
         progress()

@@ -10,7 +10,7 @@ from r2flow.base.errors import InputError
 from r2flow.base.registry import Count, Options, construct
 from r2flow.generators.base import Generator
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
+from r2flow.samplers.base import Generated, Known, Noise, Sampler, Tick, last_of
 from r2flow.systems.diffusion.generator import DDIM, Share
 from r2flow.systems.diffusion.process import PREDICTIONS, walk
 from r2flow.systems.diffusion.schedules import DISCRETE
@@ -113,7 +113,7 @@ class LatentDDIM(Sampler):
         self.evaluations(generator)
 
     def __call__(
-        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+        self, generator: Any, noise: Tensor, condition: Known, draws: Noise, progress: Tick
     ) -> Generated:
         times = _some_of(len(generator.log_snr), self.steps)
         log_snrs = generator.log_snr[[*times.tolist(), 0]]

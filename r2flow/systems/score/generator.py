@@ -20,7 +20,7 @@ from r2flow.base.registry import Count, Options, Positive
 from r2flow.flow.solvers.solution import finite
 from r2flow.generators.base import IMAGE, KNOWN, Generator
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.samplers.base import Call, Fresh, Generated, Given, Sampler, last_of
+from r2flow.samplers.base import Generated, Known, Noise, Sampler, Tick, last_of
 from r2flow.systems.score.refinenet import RefineNet
 
 _Score = Callable[[Tensor, Tensor], Tensor]
@@ -140,7 +140,7 @@ class Langevin(Sampler):
         return len(generator.network.sigmas) * self.steps + 1
 
     def __call__(
-        self, generator: Any, noise: Tensor, condition: Given, draws: Fresh, progress: Call
+        self, generator: Any, noise: Tensor, condition: Known, draws: Noise, progress: Tick
     ) -> Generated:
         x = torch.special.ndtr(noise)
         image = known = torch.zeros_like(x)
@@ -152,7 +152,6 @@ class Langevin(Sampler):
             """Likelihood gradient of the known pixels (Zyrianov et al. 2022, eq. 8)."""
             return generator.pull * known * ((image + 1) / 2 - x)
 
-        assert draws is not None
         network = generator.network
         rate = generator.rate
         states = _annealed_langevin(network, x, network.sigmas, draws, rate, self.steps, pull)
