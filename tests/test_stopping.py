@@ -136,7 +136,10 @@ MAKE = 'Store("out", "scans", {{}}).make(range(4), functools.partial(print, byte
 READ = 'list(ScanSet("", source, None).batches(range(99), 1, 2))'
 
 
-@pytest.mark.parametrize("number", STOPPING)
+@pytest.mark.parametrize(
+    "number",
+    [STOPPING[0], *(pytest.param(number, marks=pytest.mark.slow) for number in STOPPING[1:])],
+)
 # the latter within an import
 @pytest.mark.parametrize(("work", "said"), [(MAKE, [""]), (READ, ["", "stopped\n"])])
 def test_told_to_stop_when_workers_start(tmp_path: Path, number: int, work: str, said: list[str]):

@@ -23,7 +23,7 @@ from tests.training.conftest import scans, tiny  # noqa: F401  a fixture
 R2FLOW = [sys.executable, "-m", "r2flow"]
 
 
-@pytest.mark.parametrize("channel", [os.pipe, os.openpty])
+@pytest.mark.parametrize("channel", [os.pipe, pytest.param(os.openpty, marks=pytest.mark.slow)])
 def test_a_training_outlives_the_reader_of_its_output(tmp_path: Path, scans: Path, channel):  # noqa: F811
     """As of `2>&1 | head -1`, or of a terminal that is closed."""
     more = ["trainer.max_steps=6", "callbacks.progress.seconds=0", "samples.num=0", "run_dir=run"]
