@@ -333,7 +333,7 @@ def test_a_batch_of_pairs_with_scans_beside_is_a_function_of_its_number(tmp_path
 
 
 def test_a_stage_of_jumps_says_what_it_lacks(parent):
-    with pytest.raises(InputError, match="has no argument 'time'"):
+    with pytest.raises(InputError, match="no option 'time'"):
         stage(time={"name": "uniform"})
     with pytest.raises(InputError, match="'step'"):
         stage(jumps={"step": [1]})

@@ -1,11 +1,10 @@
-"""Named arguments of constructors: wrong ones are refused, docstrings describe all."""
+"""Named arguments of constructors: signatures and docstrings have all, values are checked."""
 
 import inspect
 import re
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
-from r2flow.base.errors import InputError
-from r2flow.base.registry import did_you_mean
+from r2flow.base.registry import check_options, signature_of
 
 # One argument in a docstring's `Args`, with its lines.
 _SAID = re.compile(r"^(    (\w+): .*(?:\n      +.*)*)", re.M)
@@ -14,24 +13,28 @@ _SAID = re.compile(r"^(    (\w+): .*(?:\n      +.*)*)", re.M)
 class NamedArguments:
     """Base of classes whose constructors name each argument.
 
-    A wrong name is refused with the right one. A subclass describes its own arguments; its
+    Names and values are checked by the annotations, as those of a config. A subclass whose
+    constructor passes `**options` on to its base has the arguments of its base, or those that
+    `**options: Unpack[TYPED_DICT]` names, in its signature. It describes its own arguments; its
     `__doc__` takes the sentences of the others from its base.
     """
 
+    __signature__: ClassVar[inspect.Signature | None]
+
     def __new__(cls, *args: Any, **options: Any) -> Self:
-        parameters = inspect.signature(cls).parameters
-        if not any(one.kind is one.VAR_KEYWORD for one in parameters.values()):
-            for name in options.keys() - parameters.keys():
-                hint = did_you_mean(name, list(parameters)) or f" It has {', '.join(parameters)}."
-                raise InputError(f"{cls.__name__} has no argument '{name}'.{hint}")
+        if args or options:  # a copy is made without
+            positional = zip(inspect.signature(cls).parameters, args, strict=False)
+            check_options(cls.__name__, cls, dict(positional) | options)
         return super().__new__(cls)
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
+        cls.__signature__ = None  # not that of the base
+        cls.__signature__ = signature_of(cls)
         before, own, after = _parts(cls.__dict__.get("__doc__"))
         _, inherited, _ = _parts(cls.__base__.__doc__)
         said = inherited | own
-        listed = [said[name] for name in inspect.signature(cls).parameters if name in said]
+        listed = [said[name] for name in cls.__signature__.parameters if name in said]
         arguments = "\n".join(["Args:", *listed])
         cls.__doc__ = "\n\n".join(filter(None, [before, arguments, after]))
 

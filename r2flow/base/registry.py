@@ -9,7 +9,17 @@ from contextlib import contextmanager
 from functools import cache, partial
 from importlib.resources import files
 from pkgutil import resolve_name
-from typing import Annotated, Any, ClassVar, NamedTuple, NotRequired, Required, TypeVar
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    NamedTuple,
+    NotRequired,
+    Required,
+    TypeVar,
+    get_args,
+    get_type_hints,
+)
 
 from omegaconf import OmegaConf
 from pydantic import (
@@ -250,25 +260,36 @@ def options_of(constructor: Callable[..., Any], given: int = 0) -> Config:
     return {name: MISSING if p.default is p.empty else p.default for name, p in parameters.items()}
 
 
-def _by_keyword(constructor: Callable[..., Any], given: int = 0) -> dict[str, inspect.Parameter]:
-    """Parameters after `given` positional ones; of a class that passes `**options` on, also those
-    of its base.
+_SEVERAL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+
+
+def signature_of(constructor: Callable[..., Any]) -> inspect.Signature:
+    """The signature of a constructor.
+
+    A class that passes `**options` on to its base has the arguments of that by keyword, or those
+    that `**options: Unpack[TYPED_DICT]` names.
     """
-    parameters = inspect.signature(constructor).parameters.values()
-    named = {p.name: p for p in parameters if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)}
-    positional = [name for name, p in named.items() if p.kind is not p.KEYWORD_ONLY][:given]
-    passes_on = any(p.kind is p.VAR_KEYWORD for p in parameters)
-    if passes_on and inspect.isclass(constructor) and constructor.__bases__[0] is not object:
-        named |= {
-            name: p
-            for name, p in _by_keyword(constructor.__bases__[0], given).items()
-            if name not in named
-        }
-    return {
-        name: p
-        for name, p in named.items()
-        if name not in positional and p.kind is not p.POSITIONAL_ONLY
-    }
+    signature = inspect.signature(constructor)
+    own = list(signature.parameters.values())
+    if not (own and own[-1].kind is own[-1].VAR_KEYWORD and inspect.isclass(constructor)):
+        return signature
+    _, base, *_ = [one for one in constructor.__mro__ if "__init__" in vars(one)]
+    inherited = signature_of(base).parameters
+    passed = inherited.keys() - signature.parameters.keys()
+    for typed in get_args(own.pop().annotation):
+        passed &= get_type_hints(typed).keys()
+    taken = [p for p in inherited.values() if p.name in passed and p.kind not in _SEVERAL]
+    if not any(p.kind is p.VAR_POSITIONAL for p in own):
+        taken = [p.replace(kind=p.KEYWORD_ONLY) for p in taken if p.kind is not p.POSITIONAL_ONLY]
+    own = [p for p in own if p.kind not in _SEVERAL]
+    return signature.replace(parameters=sorted([*own, *taken], key=lambda p: p.kind))
+
+
+def _by_keyword(constructor: Callable[..., Any], given: int = 0) -> dict[str, inspect.Parameter]:
+    """Parameters that can be given by keyword, after `given` positional ones."""
+    named = [p for p in signature_of(constructor).parameters.values() if p.kind not in _SEVERAL]
+    positional = [p for p in named if p.kind is not p.KEYWORD_ONLY][:given]
+    return {p.name: p for p in named if p not in positional and p.kind is not p.POSITIONAL_ONLY}
 
 
 @cache

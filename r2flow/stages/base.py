@@ -1,12 +1,13 @@
 """Base classes of stages: LightningModules that train a generator."""
 
+import inspect
 import logging
 import math
 from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypedDict
 
 import lightning as L
 import torch
@@ -51,6 +52,27 @@ ParentLike = str | Path | Parent | Options | None
 SamplerLike = str | Options | None
 TimeLike = str | Options
 Betas = tuple[Portion, Portion]
+
+
+class ModelArguments(TypedDict, total=False):
+    """Arguments by keyword of each stage, as in `Stage`."""
+
+    encoding: EncodingLike
+    generator: GeneratorLike
+    parent: ParentLike
+    sampler: SamplerLike
+    few: SamplerLike
+    seed: Seed
+
+
+class StageArguments(ModelArguments, total=False):
+    """Those of a stage that is optimised as `Stage` is."""
+
+    learning_rate: NonNegative
+    betas: Betas
+    weight_decay: NonNegative
+    muon: NonNegative | None
+    warmup_images: Natural
 
 
 class Stage(L.LightningModule, NamedArguments):
@@ -110,9 +132,9 @@ class Stage(L.LightningModule, NamedArguments):
         self,
         backbone: BackboneLike = None,
         sensor: SensorLike = None,
+        *,
         encoding: EncodingLike = None,
         generator: GeneratorLike = None,
-        *,
         parent: ParentLike = None,
         sampler: SamplerLike = None,
         few: SamplerLike = None,
@@ -125,6 +147,10 @@ class Stage(L.LightningModule, NamedArguments):
     ) -> None:
         super().__init__()
         self.save_hyperparameters(ignore=["parent", *MODEL])
+        if inspect.getfullargspec(type(self).__init__).varkw:
+            # `load_from_checkpoint` would give it those that it sets for its base, too.
+            for name in self.hparams.keys() - inspect.signature(type(self)).parameters:
+                del self.hparams[name]
         self.own_network = isinstance(backbone, nn.Module)
         source = None
         if parent is not None and not isinstance(parent, Mapping):
@@ -446,6 +472,10 @@ class Stage(L.LightningModule, NamedArguments):
             with naming("the checkpoint"):  # a plug-in may have changed
                 check_weights(self, state_dict)
         return super().load_state_dict(state_dict, strict, assign)
+
+
+# LightningCLI describes arguments by it.
+ModelArguments.__doc__ = StageArguments.__doc__ = Stage.__doc__
 
 
 class SingleLoss(Stage):

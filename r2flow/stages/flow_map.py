@@ -1,10 +1,12 @@
 """Flow map training: jumps of any length, from the paths of an earlier flow, its pairs or scans."""
 
+from typing import Unpack
+
 import torch
 from torch import Tensor
 
 from r2flow.base.errors import InputError
-from r2flow.base.registry import Natural, NonNegative, Options, Positive, Seed, construct
+from r2flow.base.registry import Options, Positive, construct
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.flow.maps import OBJECTIVES, Aim, JumpTimes, straight
 from r2flow.flow.path import expand_time, interpolate
@@ -14,12 +16,8 @@ from r2flow.samplers import Jump
 from r2flow.stages.base import (
     BackboneLike,
     Batch,
-    Betas,
-    EncodingLike,
-    GeneratorLike,
-    ParentLike,
-    SamplerLike,
     SensorLike,
+    StageArguments,
 )
 from r2flow.stages.rectify import Reflow
 
@@ -49,38 +47,18 @@ class LearnFlowMap(Reflow):
         self,
         backbone: BackboneLike = None,
         sensor: SensorLike = None,
-        encoding: EncodingLike = None,
-        generator: GeneratorLike = None,
         *,
         objective: str = "consistency",
         jumps: Options | None = None,
         rho: Positive = 0.01,
         loss: str = "pseudo_huber",
-        parent: ParentLike = None,
-        sampler: SamplerLike = None,
-        few: SamplerLike = None,
-        seed: Seed = 0,
-        learning_rate: NonNegative = 2e-3,
-        betas: Betas = (0.9, 0.99),
-        weight_decay: NonNegative = 0.0,
-        muon: NonNegative | None = None,
-        warmup_images: Natural = 400,
+        **options: Unpack[StageArguments],
     ) -> None:
         super().__init__(
             backbone,
             sensor,
-            encoding,
-            generator,
             loss=loss,
-            parent=parent,
-            sampler=sampler,
-            few=few,
-            seed=seed,
-            learning_rate=learning_rate,
-            betas=betas,
-            weight_decay=weight_decay,
-            muon=muon,
-            warmup_images=warmup_images,
+            **options,
         )
         self.objective = OBJECTIVES[objective]
         self.rho = rho

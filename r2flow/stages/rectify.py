@@ -2,12 +2,12 @@
 earlier flow.
 """
 
-from typing import ClassVar
+from typing import ClassVar, Unpack
 
 from torch import Tensor
 
 from r2flow.base.errors import InputError
-from r2flow.base.registry import Count, Natural, NonNegative, Seed
+from r2flow.base.registry import Count
 from r2flow.flow.losses import LOSSES
 from r2flow.flow.path import interpolate
 from r2flow.flow.times import TIMES
@@ -17,13 +17,9 @@ from r2flow.samplers import FixedSteps
 from r2flow.stages.base import (
     BackboneLike,
     Batch,
-    Betas,
-    EncodingLike,
-    GeneratorLike,
-    ParentLike,
-    SamplerLike,
     SensorLike,
     SingleLoss,
+    StageArguments,
     TimeLike,
 )
 
@@ -47,35 +43,15 @@ class Rectify(SingleLoss):
         self,
         backbone: BackboneLike = None,
         sensor: SensorLike = None,
-        encoding: EncodingLike = None,
-        generator: GeneratorLike = None,
         *,
         loss: str = "mse",
         time: TimeLike = "uniform",
-        parent: ParentLike = None,
-        sampler: SamplerLike = None,
-        few: SamplerLike = None,
-        seed: Seed = 0,
-        learning_rate: NonNegative = 2e-3,
-        betas: Betas = (0.9, 0.99),
-        weight_decay: NonNegative = 0.0,
-        muon: NonNegative | None = None,
-        warmup_images: Natural = 400,
+        **options: Unpack[StageArguments],
     ) -> None:
         super().__init__(
             backbone,
             sensor,
-            encoding,
-            generator,
-            parent=parent,
-            sampler=sampler,
-            few=few,
-            seed=seed,
-            learning_rate=learning_rate,
-            betas=betas,
-            weight_decay=weight_decay,
-            muon=muon,
-            warmup_images=warmup_images,
+            **options,
         )
         if self.generator.takes_condition and type(self).condition is Rectify.condition:
             name = type(self.generator).__name__
@@ -113,37 +89,17 @@ class Reflow(Rectify):
         self,
         backbone: BackboneLike = None,
         sensor: SensorLike = None,
-        encoding: EncodingLike = None,
-        generator: GeneratorLike = None,
         *,
         loss: str = "pseudo_huber",
         time: TimeLike = "u_shaped",
-        parent: ParentLike = None,
-        sampler: SamplerLike = None,
-        few: SamplerLike = None,
-        seed: Seed = 0,
-        learning_rate: NonNegative = 2e-3,
-        betas: Betas = (0.9, 0.99),
-        weight_decay: NonNegative = 0.0,
-        muon: NonNegative | None = None,
-        warmup_images: Natural = 400,
+        **options: Unpack[StageArguments],
     ) -> None:
         super().__init__(
             backbone,
             sensor,
-            encoding,
-            generator,
             loss=loss,
             time=time,
-            parent=parent,
-            sampler=sampler,
-            few=few,
-            seed=seed,
-            learning_rate=learning_rate,
-            betas=betas,
-            weight_decay=weight_decay,
-            muon=muon,
-            warmup_images=warmup_images,
+            **options,
         )
 
     def prepare_generator(self) -> None:
@@ -165,38 +121,18 @@ class Distill(Reflow):
         self,
         backbone: BackboneLike = None,
         sensor: SensorLike = None,
-        encoding: EncodingLike = None,
-        generator: GeneratorLike = None,
         *,
         steps: Count = 2,
         grid: str = "uniform",
         loss: str = "pseudo_huber",
-        parent: ParentLike = None,
-        sampler: SamplerLike = None,
-        few: SamplerLike = None,
-        seed: Seed = 0,
-        learning_rate: NonNegative = 2e-3,
-        betas: Betas = (0.9, 0.99),
-        weight_decay: NonNegative = 0.0,
-        muon: NonNegative | None = None,
-        warmup_images: Natural = 400,
+        **options: Unpack[StageArguments],
     ) -> None:
         super().__init__(
             backbone,
             sensor,
-            encoding,
-            generator,
             loss=loss,
             time={"name": "discrete", "k": steps, "grid": grid},
-            parent=parent,
-            sampler=sampler,
-            few=few,
-            seed=seed,
-            learning_rate=learning_rate,
-            betas=betas,
-            weight_decay=weight_decay,
-            muon=muon,
-            warmup_images=warmup_images,
+            **options,
         )
 
     def prepare_generator(self) -> None:

@@ -3,13 +3,13 @@
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, Unpack
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from r2flow.base.registry import Count, Natural, NonNegative, Options, Portion, Seed, construct
+from r2flow.base.registry import Count, Natural, NonNegative, Options, Portion, construct
 from r2flow.data.loader import ItemFormat
 from r2flow.generators import Generator, TransferFlow
 from r2flow.generators.base import IMAGE, KNOWN
@@ -23,10 +23,7 @@ from r2flow.stages.base import (
     BackboneLike,
     Batch,
     Betas,
-    EncodingLike,
-    GeneratorLike,
-    ParentLike,
-    SamplerLike,
+    ModelArguments,
     SensorLike,
     SingleLoss,
 )
@@ -158,34 +155,24 @@ class Transfer(SingleLoss):
         self,
         backbone: BackboneLike = None,
         sensor: SensorLike = None,
-        encoding: EncodingLike = None,
-        generator: GeneratorLike = None,
         *,
         tasks: Options | None = None,
-        parent: ParentLike = None,
-        sampler: SamplerLike = None,
-        few: SamplerLike = None,
-        seed: Seed = 0,
         learning_rate: NonNegative = 2e-3,
         betas: Betas = (0.9, 0.99),
         weight_decay: NonNegative = 0.0,
         muon: NonNegative | None = None,
         warmup_images: Natural = 800,
+        **options: Unpack[ModelArguments],
     ) -> None:
         super().__init__(
             backbone,
             sensor,
-            encoding,
-            generator,
-            parent=parent,
-            sampler=sampler,
-            few=few,
-            seed=seed,
             learning_rate=learning_rate,
             betas=betas,
             weight_decay=weight_decay,
             muon=muon,
             warmup_images=warmup_images,
+            **options,
         )
         self.tasks = construct("stage.tasks", Tasks, tasks)
 

@@ -14,7 +14,7 @@ from r2flow.base.errors import InputError
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.generators import Generated, Generator
 from r2flow.samplers import FixedSteps
-from r2flow.stages import STAGES, Rectify, Stage
+from r2flow.stages import STAGES, Distill, Rectify, Stage
 from r2flow.stages.base import SingleLoss
 from r2flow.stages.muon import Muon, is_hidden_matrix, orthogonalised
 from tests.conftest import quiet_trainer
@@ -263,5 +263,20 @@ def test_every_argument_is_named_typed_and_described(name):
     ],
 )
 def test_a_wrong_name_is_answered_with_the_right_one(wrong, right):
-    with pytest.raises(InputError, match=rf"has no argument '\w+'\. Did you mean '{right}'\?"):
+    with pytest.raises(InputError, match=rf"no option '\w+'; .*Did you mean '{right}'\?"):
+        wrong()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "name"),
+    [
+        (lambda: Rectify(learning_rate=-1), "learning_rate"),
+        (lambda: Rectify("hdit_tiny", 64), "sensor"),
+        (lambda: Distill(steps=0), "steps"),
+        (lambda: Distill(betas=(0.9, 1)), r"betas\.1"),
+        (lambda: ScanDataModule(batch_size=0), "batch_size"),
+    ],
+)
+def test_a_value_out_of_bounds_is_refused_by_its_name(wrong, name):
+    with pytest.raises(InputError, match=rf"^\w+: {name}"):
         wrong()

@@ -1,19 +1,17 @@
 """Training of diffusion models."""
 
+from typing import Unpack
+
 import torch.nn.functional as F
 from torch import Tensor
 
-from r2flow.base.registry import Natural, NonNegative, Positive, Registry, Seed
+from r2flow.base.registry import Positive, Registry
 from r2flow.stages.base import (
     BackboneLike,
     Batch,
-    Betas,
-    EncodingLike,
-    GeneratorLike,
-    ParentLike,
-    SamplerLike,
     SensorLike,
     SingleLoss,
+    StageArguments,
 )
 from r2flow.systems.diffusion.generator import Diffusion
 from r2flow.systems.diffusion.process import noised
@@ -40,36 +38,16 @@ class LearnDiffusion(SingleLoss):
         self,
         backbone: BackboneLike = None,
         sensor: SensorLike = None,
-        encoding: EncodingLike = None,
-        generator: GeneratorLike = None,
         *,
         loss: str = "l2",
         min_snr: Positive | None = 5.0,
         paired: bool = True,
-        parent: ParentLike = None,
-        sampler: SamplerLike = None,
-        few: SamplerLike = None,
-        seed: Seed = 0,
-        learning_rate: NonNegative = 2e-3,
-        betas: Betas = (0.9, 0.99),
-        weight_decay: NonNegative = 0.0,
-        muon: NonNegative | None = None,
-        warmup_images: Natural = 400,
+        **options: Unpack[StageArguments],
     ) -> None:
         super().__init__(
             backbone,
             sensor,
-            encoding,
-            generator,
-            parent=parent,
-            sampler=sampler,
-            few=few,
-            seed=seed,
-            learning_rate=learning_rate,
-            betas=betas,
-            weight_decay=weight_decay,
-            muon=muon,
-            warmup_images=warmup_images,
+            **options,
         )
         self.error = ERRORS[loss]
         self.min_snr = min_snr

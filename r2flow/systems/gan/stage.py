@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from torch import Tensor, nn
@@ -15,17 +15,13 @@ from r2flow.base.registry import (
     Options,
     Portion,
     Registry,
-    Seed,
     construct,
 )
 from r2flow.stages.base import (
     BackboneLike,
     Batch,
     Betas,
-    EncodingLike,
-    GeneratorLike,
-    ParentLike,
-    SamplerLike,
+    ModelArguments,
     SensorLike,
     Stage,
 )
@@ -142,33 +138,23 @@ class LearnGan(Stage):
         self,
         backbone: BackboneLike = None,
         sensor: SensorLike = None,
-        encoding: EncodingLike = None,
-        generator: GeneratorLike = None,
         *,
         discriminator: str | Options = "dcgan",
         r1: NonNegative = 1.0,
         r1_every: Count = 16,
         warmup: Options | None = None,
         augment: Options | None = _ALL_DEFAULTS,
-        parent: ParentLike = None,
-        sampler: SamplerLike = None,
-        few: SamplerLike = None,
-        seed: Seed = 0,
         learning_rate: NonNegative = 2e-3,
         betas: Betas = (0.0, 0.99),
+        **options: Unpack[ModelArguments],
     ) -> None:
         super().__init__(
             backbone,
             sensor,
-            encoding,
-            generator,
-            parent=parent,
-            sampler=sampler,
-            few=few,
-            seed=seed,
             learning_rate=learning_rate,
             betas=betas,
             warmup_images=0,
+            **options,
         )
         self.automatic_optimization = False
         self.r1 = r1

@@ -1,22 +1,19 @@
 """Training of LiDM: an adversarial autoencoder, and the diffusion of its latents."""
 
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from r2flow.base.processes import mean_over_processes
-from r2flow.base.registry import Count, Natural, NonNegative, Options, Seed, construct
+from r2flow.base.registry import Count, Natural, NonNegative, Options, construct
 from r2flow.lidar.encoding import Encoding
 from r2flow.stages.base import (
     BackboneLike,
     Batch,
     Betas,
-    EncodingLike,
-    GeneratorLike,
-    ParentLike,
-    SamplerLike,
+    ModelArguments,
     SensorLike,
     SingleLoss,
     Stage,
@@ -130,8 +127,6 @@ class LearnAutoencoder(Stage):
         self,
         backbone: BackboneLike = None,
         sensor: SensorLike = None,
-        encoding: EncodingLike = None,
-        generator: GeneratorLike = None,
         *,
         discriminator: Options | None = None,
         adversarial_weight: NonNegative = 0.6,
@@ -139,30 +134,22 @@ class LearnAutoencoder(Stage):
         inverted: bool = False,
         codebook_weight: NonNegative = 1.0,
         mask_factor: NonNegative = 1.0,
-        parent: ParentLike = None,
-        sampler: SamplerLike = None,
-        few: SamplerLike = None,
-        seed: Seed = 0,
         learning_rate: NonNegative = 3.6e-5,
         betas: Betas = (0.5, 0.9),
         weight_decay: NonNegative = 0.0,
         muon: NonNegative | None = None,
         warmup_images: Natural = 0,
+        **options: Unpack[ModelArguments],
     ) -> None:
         super().__init__(
             backbone,
             sensor,
-            encoding,
-            generator,
-            parent=parent,
-            sampler=sampler,
-            few=few,
-            seed=seed,
             learning_rate=learning_rate,
             betas=betas,
             weight_decay=weight_decay,
             muon=muon,
             warmup_images=warmup_images,
+            **options,
         )
         self.automatic_optimization = False
         self.autoencoder = self.generator.first_stage_model
@@ -229,33 +216,23 @@ class LearnLatentDiffusion(SingleLoss):
         self,
         backbone: BackboneLike = None,
         sensor: SensorLike = None,
-        encoding: EncodingLike = None,
-        generator: GeneratorLike = None,
         *,
-        parent: ParentLike = None,
-        sampler: SamplerLike = None,
-        few: SamplerLike = None,
-        seed: Seed = 0,
         learning_rate: NonNegative = 1.6e-5,
         betas: Betas = (0.9, 0.999),
         weight_decay: NonNegative = 0.01,
         muon: NonNegative | None = None,
         warmup_images: Natural = 0,
+        **options: Unpack[ModelArguments],
     ) -> None:
         super().__init__(
             backbone,
             sensor,
-            encoding,
-            generator,
-            parent=parent,
-            sampler=sampler,
-            few=few,
-            seed=seed,
             learning_rate=learning_rate,
             betas=betas,
             weight_decay=weight_decay,
             muon=muon,
             warmup_images=warmup_images,
+            **options,
         )
         self.generator.first_stage_model.requires_grad_(False)
 

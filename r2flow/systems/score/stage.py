@@ -1,17 +1,16 @@
 """Training by denoising score matching."""
 
+from typing import Unpack
+
 import torch
 from torch import Tensor
 
-from r2flow.base.registry import Natural, NonNegative, Seed
+from r2flow.base.registry import Natural, NonNegative
 from r2flow.stages.base import (
     BackboneLike,
     Batch,
     Betas,
-    EncodingLike,
-    GeneratorLike,
-    ParentLike,
-    SamplerLike,
+    ModelArguments,
     SensorLike,
     SingleLoss,
 )
@@ -36,34 +35,24 @@ class MatchScore(SingleLoss):
         self,
         backbone: BackboneLike = None,
         sensor: SensorLike = None,
-        encoding: EncodingLike = None,
-        generator: GeneratorLike = None,
         *,
         power: NonNegative = 2.0,
-        parent: ParentLike = None,
-        sampler: SamplerLike = None,
-        few: SamplerLike = None,
-        seed: Seed = 0,
         learning_rate: NonNegative = 1e-4,
         betas: Betas = (0.9, 0.999),
         weight_decay: NonNegative = 0.0,
         muon: NonNegative | None = None,
         warmup_images: Natural = 0,
+        **options: Unpack[ModelArguments],
     ) -> None:
         super().__init__(
             backbone,
             sensor,
-            encoding,
-            generator,
-            parent=parent,
-            sampler=sampler,
-            few=few,
-            seed=seed,
             learning_rate=learning_rate,
             betas=betas,
             weight_decay=weight_decay,
             muon=muon,
             warmup_images=warmup_images,
+            **options,
         )
         self.power = power
 
