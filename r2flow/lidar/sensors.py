@@ -14,7 +14,7 @@ import yaml
 from numpy import ndarray
 from torch import Tensor
 
-from r2flow.base.errors import InputError, quoted
+from r2flow.base.errors import InputError, check, quoted
 from r2flow.base.files import parse_yaml, reading, write_file
 from r2flow.base.registry import Registry, check_options, construct, options_of
 
@@ -43,14 +43,14 @@ class Sensor:
     error_factors: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "elevations", _plain(self.elevations))  # lists have no hash
-        if self.firing is not None:
-            object.__setattr__(self, "firing", _plain(self.firing))
-        if self.error_factors is not None:
-            object.__setattr__(self, "error_factors", _plain(self.error_factors))
+        for field in ("elevations", "firing", "error_factors"):
+            values = getattr(self, field)
+            if values is not None:  # lists have no hash
+                object.__setattr__(self, field, tuple(np.asarray(values).tolist()))
         rows = len(self.elevations)
         order = range(rows) if self.firing is None else self.firing
         scale = 1.0 if self.reflectance_scale is None else self.reflectance_scale
+        factors = (1.0, 1.0) if self.error_factors is None else self.error_factors
         inside = (90.0, *self.elevations, -90.0)
         rules = {
             "elevations must be two or more, from the top row down within (-90, 90) degrees": (
@@ -64,22 +64,18 @@ class Sensor:
             "firing must name each row once": sorted(order) == list(range(rows)),
             "reflectance_scale must be a positive number": 0 < scale < inf,
             "error_factors must be two positive numbers": (
-                self.error_factors is None
-                or (len(self.error_factors) == 2 and all(0 < x < inf for x in self.error_factors))
+                len(factors) == 2 and all(0 < factor < inf for factor in factors)
             ),
         }
         for rule, holds in rules.items():
-            if not holds:
-                raise InputError(f"sensor {quoted(self.name)}: {rule}.")
+            check(holds, f"sensor {quoted(self.name)}: {rule}.")
 
     def described(self) -> dict[str, Any]:
         """All fields that images depend on, as plain values: all except `reflectance_scale` and
         `error_factors`.
         """
-        fields = asdict(self)
-        del fields["reflectance_scale"]
-        del fields["error_factors"]
-        return fields
+        calibrated = ("reflectance_scale", "error_factors")
+        return {name: value for name, value in asdict(self).items() if name not in calibrated}
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -141,10 +137,10 @@ class Sensor:
         if rows is None or rows == old:
             return sensor
         most = MOST_PIXELS // sensor.columns
-        if not 2 <= rows <= most:
-            raise InputError(
-                f"sensor {quoted(self.name)}: rows must be 2 to {most:,}, found {rows}."
-            )
+        check(
+            2 <= rows <= most,
+            f"sensor {quoted(self.name)}: rows must be 2 to {most:,}, found {rows}.",
+        )
         if rows > old and rays == "centre":
             beam = np.arange(-1, old + 1)  # with a step beyond the first and the last beam
             above = min(2 * e[0] - e[1], e[0] / 2 + 45)
@@ -157,59 +153,21 @@ class Sensor:
         return replace(sensor, elevations=tuple(middle.tolist()), firing=None)  # not one laser each
 
 
-def _plain(values: Sequence[float] | ndarray) -> tuple:
-    """The values of a list or an array as a tuple of Python's numbers."""
-    return tuple(np.asarray(values).tolist())
+def _built_in(name: str) -> Sensor:
+    file = files("r2flow.lidar") / "built_in" / f"{name}.yaml"
+    return Sensor(**yaml.safe_load(file.read_text(encoding="utf-8")))
 
 
-def _beams(top: float, step: float, count: int) -> tuple[float, ...]:
-    return tuple(top - step * beam for beam in range(count))
-
-
-def _lasers(name: str) -> tuple[float, ...]:
-    """Measured elevations in degrees of a sensor's lasers, one a line of `lasers/NAME.txt`."""
-    file = files("r2flow.lidar") / "lasers" / f"{name}.txt"
-    lines = file.read_text(encoding="utf-8").splitlines()
-    return tuple(float(line) for line in lines if not line.startswith("#"))
-
-
-def _halves_in_turn(rows: int) -> tuple[int, ...]:
-    """Firing order of Velodyne's 16 and 32 evenly spaced lasers.
-
-    The lower and the upper half alternate, both upwards.
-    """
-    return tuple(np.arange(rows)[::-1].reshape(2, -1).T.ravel().tolist())
-
-
-def _by_laser(elevations: Sequence[float]) -> dict[str, Any]:
-    """Elevations and firing order of a sensor, from the elevations of its lasers in order."""
-    order = np.argsort(-np.asarray(elevations), kind="stable")
-    return {
-        "elevations": _plain(np.asarray(elevations)[order]),
-        "firing": _plain(np.argsort(order)),
-    }
-
-
-# Ranges and beams from the manuals: HDL-32E 63-9113, VLP-16 63-9243, VLP-32C 63-9325 (Velodyne);
-# OS1 datasheet of its first generation, whose 64 beams span +-16.6 degrees and whose 128 span
-# +-22.5 (Ouster); Pandar64 640-en (Hesai). OS1 beams are calibrated per unit and differ by up to
-# half a degree: `r2flow sensor` estimates them from scans. hdl64e is the image of the paper: 64
-# equal bins between +3 and -25 degrees, 1.45 to 80 m. It has no firing order: packets list the
-# lasers by number, and the calibrated elevations differ between units.
 SENSORS: Registry[Sensor] = Registry(
     "sensor",
-    hdl64e=Sensor("hdl64e", _beams(3 - 7 / 32, 7 / 16, 64)),
-    hdl64e_rings=Sensor("hdl64e_rings", _lasers("hdl64e_rings")),
-    hdl32e=Sensor(
-        "hdl32e", _beams(32 / 3, 4 / 3, 32), 1024, 1.0, 100.0, 1.84, firing=_halves_in_turn(32)
-    ),
-    vlp16=Sensor(
-        "vlp16", _beams(15.0, 2.0, 16), min_range=0.5, max_range=100.0, firing=_halves_in_turn(16)
-    ),
-    vlp32c=Sensor("vlp32c", **_by_laser(_lasers("vlp32c")), min_range=0.5, max_range=200.0),
-    os1_64=Sensor("os1_64", _beams(16.6, 33.2 / 63, 64), min_range=0.8, max_range=120.0),
-    os1_128=Sensor("os1_128", _beams(22.5, 45 / 127, 128), min_range=0.8, max_range=120.0),
-    pandar64=Sensor("pandar64", _lasers("pandar64"), min_range=0.3, max_range=200.0),
+    hdl64e=_built_in("hdl64e"),
+    hdl64e_rings=_built_in("hdl64e_rings"),
+    hdl32e=_built_in("hdl32e"),
+    vlp16=_built_in("vlp16"),
+    vlp32c=_built_in("vlp32c"),
+    os1_64=_built_in("os1_64"),
+    os1_128=_built_in("os1_128"),
+    pandar64=_built_in("pandar64"),
 )
 
 
@@ -236,18 +194,20 @@ def build_sensor(
         raise InputError(f"{name!r} is a built-in sensor; give your own sensor another name.")
     else:
         sensor = Sensor(name, tuple(e + 0.0 for e in elevations))  # no -0.0
-    if firing is not None:
-        sensor = replace(sensor, firing=tuple(firing))
-    if error_factors is not None:
-        sensor = replace(sensor, error_factors=tuple(error_factors))
-    limits = {
+    options: dict[str, Any] = {
         "min_range": min_range,
         "max_range": max_range,
         "height": height,
+        "firing": firing,
         "reflectance_scale": reflectance_scale,
+        "error_factors": error_factors,
     }
-    given = {key: float(value) for key, value in limits.items() if value is not None}
-    return replace(sensor.resized(rows, columns, rays), **given)  # type: ignore[arg-type]
+    options = {
+        name: float(value) if isinstance(value, int) else value
+        for name, value in options.items()
+        if value is not None
+    }
+    return replace(sensor, **options).resized(rows, columns, rays)
 
 
 def read_sensor(path: str | Path) -> Sensor:
@@ -256,8 +216,8 @@ def read_sensor(path: str | Path) -> Sensor:
         options = parse_yaml(Path(path).read_text(encoding="utf-8"))
         if not isinstance(options, dict):
             raise InputError("it is not a sensor: give `name: mine`, `elevations: [15.0, ...]`.")
-        if options.get("rays", "centre") != "centre":
-            raise InputError("rays are a model's: give sensor.rays=reference in training.")
+        centre = options.get("rays", "centre") == "centre"
+        check(centre, "rays are a model's: give sensor.rays=reference in training.")
         return construct(str(path), build_sensor, options)
 
 
@@ -301,5 +261,5 @@ def sensor_options(sensor: Sensor | str | Mapping[str, Any]) -> dict[str, Any]:
         return options_of_sensor(sensor)
     if isinstance(sensor, str) and sensor.lower().endswith(ENDINGS):
         return options_of_sensor(read_sensor(sensor))
-    chosen = {**options_of(build_sensor), **SENSORS.options(sensor)}
-    return check_options("sensor", build_sensor, chosen)
+    options = {**options_of(build_sensor), **SENSORS.options(sensor)}
+    return check_options("sensor", build_sensor, options)
