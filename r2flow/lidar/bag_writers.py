@@ -24,15 +24,8 @@ def new_recording(out: Path, topic: str, kind: str) -> Recording:
     ROS 2.
     """
     require(str(out), "formats", "rosbags")
-    from rosbags import interfaces as ros
-
     ros1 = out.suffix.lower() == ".bag"
-    none = ros.MessageDefinition(ros.MessageDefinitionFormat.NONE, "")
-    more: Any = (
-        ros.ConnectionExtRosbag1(None, None) if ros1 else ros.ConnectionExtRosbag2("cdr", [])
-    )
-    connection = ros.Connection(0, topic, kind.replace("/", "/msg/"), none, "", 0, more, None)
-    channel = Channel(topic, kind, "ros1" if ros1 else "cdr", connection)
+    channel = Channel(topic, kind, "ros1" if ros1 else "cdr")
     return Recording(out, ".bag" if ros1 else ".db3", (channel,))
 
 
@@ -80,17 +73,17 @@ def _write_mcap(part: Path, out: Path, like: Recording, messages: Iterable[Messa
         numbers: dict[str, int] = {}
 
         def number(channel: Channel) -> int:
-            schema, own = channel.original
-            key = repr((own, schema))
+            schema, known = channel.original
+            key = repr((known, schema))
             if key not in numbers:
                 described = (schema.name, schema.encoding, schema.data) if schema else None
                 if described and described not in schemas:
                     schemas[described] = writer.register_schema(*described)
                 numbers[key] = writer.register_channel(
-                    own.topic,
-                    own.message_encoding,
+                    known.topic,
+                    known.message_encoding,
                     schemas[described] if described else 0,
-                    own.metadata,
+                    known.metadata,
                 )
             return numbers[key]
 
@@ -124,11 +117,13 @@ def _write_ros(part: Path, out: Path, like: Recording, messages: Iterable[Messag
     with writer:
 
         def connection(channel: Channel) -> Any:
-            own = channel.original
-            key = own.topic, own.msgtype, own.digest, repr(own.ext)
+            known = channel.original
+            key = channel.topic, channel.kind, repr(known and (known.digest, known.ext))
             if key not in connections:
+                kind = known.msgtype if known else channel.kind.replace("/", "/msg/")
+                more = known.ext._asdict() if known else {}
                 connections[key] = writer.add_connection(
-                    own.topic, own.msgtype, **_definition(channel), **own.ext._asdict()
+                    channel.topic, kind, **_definition(channel), **more
                 )
             return connections[key]
 
@@ -141,16 +136,11 @@ def _write_ros(part: Path, out: Path, like: Recording, messages: Iterable[Messag
     return part / "recording" / f"recording{ending}"
 
 
-def _definition(channel: Channel) -> dict[str, str]:
+def _definition(channel: Channel) -> dict[str, Any]:
     """The definition of a type and its hash, which recordings before ROS 2 Iron do not store."""
-    own = channel.original
-    text, digest = own.msgdef.data, own.digest
-    ros1 = channel.encoding == "ros1"
-    if not digest and own.msgtype in type_store(channel.encoding).types:
-        text, digest = type_store(channel.encoding).generate_msgdef(
-            own.msgtype, ros_version=1 if ros1 else 2
-        )
-        if not ros1:
-            digest = type_store(channel.encoding).hash_rihs01(own.msgtype)
-    # rosbags takes no empty hash.
-    return {"msgdef": text, "md5sum" if ros1 else "rihs01": digest or " "}
+    known = channel.original
+    store = type_store(channel.encoding)
+    if not known or (not known.digest and known.msgtype in store.types):
+        return {"typestore": store}
+    digest = "md5sum" if channel.encoding == "ros1" else "rihs01"
+    return {"msgdef": known.msgdef.data, digest: known.digest or " "}  # rosbags takes no empty hash

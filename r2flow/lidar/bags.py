@@ -5,6 +5,7 @@ are read by the standard definition of PointCloud2, and all other messages stay 
 """
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -20,12 +21,11 @@ log = logging.getLogger(__name__)
 ENDINGS = (".mcap", ".db3", ".bag")
 LARGEST_MESSAGE = 1 << 28  # bytes unpacked; a cloud of 128 x 4096 points has 25 MB
 LARGEST_CHUNK = 1 << 30  # bytes unpacked; writers close them after a few MB
-# Python packages that read messages of other types, by their encoding; `mcap` those of any.
-_PACKAGES = {
-    "protobuf": "mcap-protobuf-support",
-    "cdr": "mcap-ros2-support",
-    "ros1": "mcap-ros1-support",
-}
+_OTHER_CLOUDS = (  # how they become scans
+    "Compressed clouds: ros2 run point_cloud_transport republish. Others: read them by the Python "
+    "package mcap-protobuf-support, mcap-ros2-support, mcap-ros1-support or mcap, and write x, y, "
+    "z, intensity of each scan by numpy.save."
+)
 _ZSTD = b"\x28\xb5\x2f\xfd"  # begins messages that rosbag2 compressed one by one
 
 
@@ -245,15 +245,16 @@ def _counted(messages: Iterable[Message]) -> tuple[list[Channel], bool]:
     .mcap without an index would hold all in memory.
     """
     found: dict[int, Channel] = {}
+    counts = Counter[int]()
     last = 0
     unsorted = False
     for message in messages:
         number = message.channel.original[1].id
-        before = found[number].count if number in found else 0
-        found[number] = replace(message.channel, count=before + 1)
+        found[number] = message.channel
+        counts[number] += 1
         unsorted |= message.recorded < last
         last = message.recorded
-    return [*found.values()], unsorted
+    return [replace(one, count=counts[number]) for number, one in found.items()], unsorted
 
 
 @contextmanager
@@ -320,25 +321,15 @@ def choose_topic(recording: Recording, topic: str | None) -> str:
     readable = sorted(
         {one.topic for one in channels if one.kind == CLOUD and one.encoding in ENCODINGS}
     )
-    chosen = readable if topic is None else [name for name in readable if name == topic]
-    if len(chosen) == 1:
-        return chosen[0]
-    if readable:
-        raise InputError(f"give one of its topics of point clouds by --topic: {_join(readable)}.")
+    found = [name for name in readable if topic in (None, name)]
+    if len(found) == 1:
+        return found[0]
+    check(not readable, f"give one of its topics of point clouds by --topic: {_join(readable)}.")
     clouds = [channel for channel in channels if "cloud" in channel.kind.lower()]
-    found = clouds or channels
-    listed = _join([f"{one.topic} ({one.kind}, encoding {one.encoding})" for one in found])
-    advice = ""
-    if any("Compressed" in channel.kind for channel in clouds):
-        advice = " Decompress them: ros2 run point_cloud_transport republish."
-    elif clouds:
-        package = _PACKAGES.get(clouds[0].encoding, "mcap")
-        advice = (
-            f" Read them by the Python package {package}, and write x, y, z, intensity of each "
-            "scan by numpy.save."
-        )
+    listed = [f"{one.topic} ({one.kind}, encoding {one.encoding})" for one in clouds or channels]
     raise InputError(
-        f"it holds no {CLOUD} in the encodings {_join(ENCODINGS)}, but {listed}.{advice}"
+        f"it holds no {CLOUD} in the encodings {_join(ENCODINGS)}, but {_join(listed)}. "
+        f"{_OTHER_CLOUDS}"
     )
 
 

@@ -114,7 +114,7 @@ def test_clouds_of_another_encoding_are_read_by_their_package(tmp_path):
         cloud.fields.append(PackedElementField(name=name, offset=4 * offset, type=kind))
     with path.open("wb") as stream, Writer(stream) as writer:
         writer.write_message("/points", cloud)
-    with pytest.raises(InputError, match=r"mcap-protobuf-support, and write .* by numpy\.save"):
+    with pytest.raises(InputError, match=r"mcap-protobuf-support, .* and write .* by numpy\.save"):
         list(read_bag(path))
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
