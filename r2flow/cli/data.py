@@ -139,7 +139,8 @@ def sensor(
     from r2flow.base.progress import track
     from r2flow.data.reading import DARK, is_dark
     from r2flow.data.sources import warn_of_frame
-    from r2flow.lidar.estimation import estimate_sensor, hangs, nearest_sensor
+    from r2flow.lidar.estimation import estimate_sensor, hangs
+    from r2flow.lidar.matching import nearest_sensor
     from r2flow.lidar.scan_files import points_beside, read_points
     from r2flow.lidar.sensors import ENDINGS, SENSORS, sensor_yaml, write_sensor
     from r2flow.reports.tables import print_table

@@ -38,7 +38,8 @@ from r2flow.data.sources import (
     spread,
     warn_of_other_sensor,
 )
-from r2flow.lidar.estimation import estimate_sensor, in_words
+from r2flow.lidar.estimation import estimate_sensor
+from r2flow.lidar.matching import in_words
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensors import SENSORS, Sensor, named_sensor
 from r2flow.model.shipped import MODELS

@@ -18,9 +18,10 @@ from r2flow.data.partial_images import FROM, is_image, read_partial
 from r2flow.data.reading import DIVIDED, Reading, nothing_in_view, reflectance_and_scale
 from r2flow.data.sources import LOOKED_AT, spread, warn_of_frame
 from r2flow.lidar.beams import check_rings
-from r2flow.lidar.estimation import FULL_REFLECTANCE, SURE, full_reflectance, other_sensor
+from r2flow.lidar.estimation import FULL_REFLECTANCE, SURE, full_reflectance
 from r2flow.lidar.known import Ray
 from r2flow.lidar.labels import common_classes, labels_beside, read_labels
+from r2flow.lidar.matching import other_sensor
 from r2flow.lidar.other_sensors import (
     Partial,
     image_through,

@@ -25,8 +25,9 @@ from r2flow.base.errors import InputError, check, warn_odd
 from r2flow.base.files import cache_folder
 from r2flow.base.progress import track
 from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
-from r2flow.lidar.estimation import Doubt, differing, hangs, in_words, is_unclear, other_sensor
+from r2flow.lidar.estimation import hangs
 from r2flow.lidar.labels import common_classes, labels_beside
+from r2flow.lidar.matching import Doubt, differing, in_words, is_unclear, other_sensor
 from r2flow.lidar.scan_files import Points, read_points, scan_ending
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.turns import SEVERAL, turns

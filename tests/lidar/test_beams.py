@@ -10,14 +10,8 @@ from r2flow.base.errors import InputError
 from r2flow.data.reading import Reading, scaled_reflectance
 from r2flow.data.sources import warn_of_frame, warn_of_other_sensor
 from r2flow.lidar.beams import FIRINGS, RING_AFTER_RING, RINGS, UNORDERED, find_beams
-from r2flow.lidar.estimation import (
-    differing,
-    estimate_sensor,
-    full_reflectance,
-    is_tilted,
-    nearest_sensor,
-    other_sensor,
-)
+from r2flow.lidar.estimation import estimate_sensor, full_reflectance
+from r2flow.lidar.matching import differing, is_tilted, nearest_sensor, other_sensor
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.scan_files import Points, read_points, write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
