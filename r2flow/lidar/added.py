@@ -46,60 +46,64 @@ def completed_cloud(
     assert given.row is not None
     of_rays = of_rays or {}
     cloud = points.cloud.take(points.kept)
-    rays = sensor.rays()
     rows, columns = sensor.shape
     row_of_ray = np.repeat(np.arange(rows, dtype=np.float32)[:, None], columns, axis=1)
     strength = image[1] if len(image) > 1 else np.zeros_like(image[0])
     channels = [image[0], strength, row_of_ray, *(values for values, _ in of_rays.values())]
     added = np.stack(channels) * (given.state != Ray.RETURN)
-    xyz, (strength, row, *others) = image_points(added.astype(np.float32), rays)
-    count = len(xyz)
-    new = {place: _unknown(column, count) for place, column in enumerate(cloud.columns)}
-
-    def fill(role: str, values: ndarray) -> None:
-        place = cloud.place(role)
-        if place is not None:
-            new[place] = as_type(values, cloud.columns[place].dtype)
-
-    for axis, values in zip("xyz", xyz.T, strict=True):
-        fill(axis, values)
+    xyz, (strength, row, *trust) = image_points(added.astype(np.float32), sensor)
+    nothing = np.zeros(len(xyz))
     ring = cloud.column("ring")
-    fill("ring", row if ring is not None and ring.any() else np.zeros(count))
     silent = points.reflectance is None or not points.reflectance.any()
-    fill("reflectance", np.zeros(count) if silent else strength * given.scale)
-    time = cloud.column("time")
-    if time is not None and not time.any():
-        fill("time", np.zeros(count))
-    elif time is not None and count:
-        azimuth = np.arctan2(*points.xyz.T[1::-1].astype(float))
-        asked = np.arctan2(*xyz.T[1::-1].astype(float))
-        name = (cloud.names or cloud.aliases)[cloud.place("time") or 0]
-        fill("time", times_of(time, given.row, azimuth, row.astype(int), asked, name))
-    measured = len(cloud)
+    values = dict(zip("xyz", xyz.T, strict=True)) | {
+        "ring": row if ring is not None and ring.any() else nothing,
+        "reflectance": nothing if silent else strength * given.scale,
+        "time": _times(given, cloud, xyz, row),
+    }
+    roles = {cloud.place(role): role for role in values}
+    new = [
+        as_type(values[roles[place]], column.dtype)
+        if place in roles
+        else _unknown(column, len(xyz))
+        for place, column in enumerate(cloud.columns)
+    ]
     whole = replace(
         cloud,
         columns=tuple(
-            np.concatenate([column, new[place]]).astype(column.dtype, copy=False)
-            for place, column in enumerate(cloud.columns)
+            np.concatenate(pair).astype(pair[0].dtype, copy=False)
+            for pair in zip(cloud.columns, new, strict=True)
         ),
         shape=None,
     )
+    measured = len(cloud)
     more: dict[str, ndarray] = {
-        MEASURED: np.repeat(np.array([1, 0], np.uint8), [measured, count]),
+        MEASURED: np.repeat(np.array([1, 0], np.uint8), [measured, len(xyz)]),
         ROW: np.concatenate([np.where(given.row < 0, NO_ROW, given.row), row]).astype(np.uint16),
     }
-    for (name, (_, of_measured)), values in zip(of_rays.items(), others, strict=True):
-        more[name] = np.concatenate([np.full(measured, of_measured, np.float32), values])
+    for (name, (_, of_measured)), of_added in zip(of_rays.items(), trust, strict=True):
+        more[name] = np.concatenate([np.full(measured, of_measured, np.float32), of_added])
     return whole.with_fields(more)
+
+
+def _times(given: Partial, cloud: Cloud, xyz: ndarray, row: ndarray) -> ndarray:
+    """Times of added points, (K,), in the type of the cloud's; 0 if these are 0 throughout."""
+    time = cloud.column("time")
+    if time is None or not time.any() or not len(xyz):
+        return np.zeros(len(xyz))
+    assert given.points is not None
+    assert given.row is not None
+    azimuth = np.arctan2(*given.points.xyz.T[1::-1].astype(float))
+    asked = np.arctan2(*xyz.T[1::-1].astype(float))
+    name = cloud.names[cloud.place("time") or 0]
+    return times_of(time, given.row, azimuth, row.astype(int), asked, name)
 
 
 def unknown_fields(cloud: Cloud) -> list[str]:
     """The fields of a scan that added points cannot have: they are NaN or 0 there."""
     known = {cloud.place(role) for role in ("x", "y", "z", "reflectance", "ring", "time")}
-    names = cloud.names or cloud.aliases
     return [
         name
-        for place, name in enumerate(names)
+        for place, name in enumerate(cloud.names)
         if place not in known and name not in (MEASURED, ROW, *TRUST)
     ]
 

@@ -13,7 +13,7 @@ from r2flow.data.partial import Sight
 from r2flow.lidar.added import completed_cloud
 from r2flow.lidar.other_sensors import gaps_unknown
 from r2flow.lidar.scan_files import Cloud, Points, points_of
-from r2flow.lidar.scan_files.tables import usual_names
+from r2flow.lidar.scan_files.tables import column_names
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.completion import complete
 from r2flow.model.sampling import HasGenerator
@@ -69,7 +69,7 @@ class Completer:
 
     def _stored(self, cloud: Cloud | ndarray) -> Cloud:
         stored = cloud if isinstance(cloud, Cloud) else _of_array(cloud, self._columns)
-        return stored if stored.names is None else stored.renamed(self._columns)
+        return stored.renamed(self._columns) if stored.named else stored
 
     def _completed(self, stored: Cloud, number: int, seed: int) -> Cloud:
         points = points_of(Path(IN_MEMORY), stored.measured())
@@ -103,4 +103,4 @@ def _of_array(array: ndarray, columns: Sequence[str] | None) -> Cloud:
     if not rows:
         return Cloud.of(array)
     width = array.shape[1]
-    return Cloud(None, tuple(array.T), tuple(usual_names(width, columns)), held=width)
+    return Cloud(tuple(column_names(width, columns)), tuple(array.T), held=width)

@@ -43,7 +43,7 @@ class Counts:
             cloud = given.points.cloud
             self.outside += given.points.dropped
             self.unknown |= dict.fromkeys(unknown_fields(cloud))
-            self.beside |= cloud.names is None and scan.ending in WRITTEN
+            self.beside |= not cloud.named and scan.ending in WRITTEN
 
 
 def print_counts(sensor: Sensor, counts: Counts) -> None:

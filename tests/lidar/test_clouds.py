@@ -99,6 +99,16 @@ def test_text_keeps_names_and_integers_that_floats_round(tmp_path: Path):
     assert list(read_cloud(tmp_path / "b.csv").columns[4]) == list(stamps)
 
 
+def test_text_keeps_the_types_of_whole_numbers(tmp_path: Path):
+    (tmp_path / "a.csv").write_text("x,y,z,ring,t,late\n1,2,3,0,0.0,1\n4,5,6,1,1.0,2.0\n")
+    write_cloud(tmp_path / "b.csv", read_cloud(tmp_path / "a.csv"))
+    lines = (tmp_path / "b.csv").read_text().split()
+    assert lines == ["x,y,z,ring,t,late", "1,2,3,0,0.0,1.0", "4,5,6,1,1.0,2.0"]
+    for name in ("a.csv", "b.csv"):
+        kinds = "".join(column.dtype.kind for column in read_cloud(tmp_path / name).columns)
+        assert kinds == "fffiff"
+
+
 @pytest.mark.parametrize(("name", "width"), [("a.bin", 4), ("a.pcd.bin", 5), ("a.npy", 4)])
 def test_what_rows_without_names_cannot_hold_lies_beside_them(tmp_path, name: str, width: int):
     rows = np.random.default_rng(0).normal(size=(30, width)).astype("f4") ** 2

@@ -50,3 +50,20 @@ def test_no_width_is_named_where_none_or_several_fit(tmp_path: Path):
         assert "made of rows of" not in str(error.value).replace("not made of rows of 4", "")
     np.random.default_rng(0).permutation(rows(4, "zeros")).tofile(path)
     assert len(read_points(path).xyz) == 3600  # without order, as named by the ending
+
+
+@pytest.mark.parametrize(
+    ("kind", "named"), [("<f8", "float64"), ("<f2", "float16"), (">f4", "big-endian float32")]
+)
+def test_rows_of_other_floats_are_named_and_converted(tmp_path: Path, kind: str, named: str):
+    path = tmp_path / "0.bin"
+    stored = (1.1 * rows(5, "numbers").astype(float)).astype(kind)  # with all bits
+    stored.tofile(path)
+    with pytest.raises(InputError, match=f"rows of 5 {named}, not float32") as error:
+        read_points(path)
+    advised = f"numpy.fromfile(FILE, '{kind}').astype('<f4').tofile(OTHER)"
+    assert advised in str(error.value)
+    np.fromfile(path, kind).astype("<f4").tofile(path)
+    np.testing.assert_array_equal(
+        read_points(path, ("x", "y", "z", "_", "_")).xyz, stored[:, :3].astype("f4")
+    )

@@ -121,11 +121,10 @@ def read_cloud(path: str | Path, columns: Sequence[str] | None = None) -> Cloud:
         if raw:
             return _with_beside(path, tables.read_rows(path, columns))
         cloud = _READERS[ending](path)
-        if cloud.names is not None:
+        if cloud.named:
             return cloud.renamed(columns)
-        width = len(cloud.columns)
-        names = tuple(tables.usual_names(width, columns))
-        return _with_beside(path, replace(cloud, aliases=names, held=width))
+        names = tuple(tables.column_names(len(cloud.columns), columns))
+        return _with_beside(path, replace(cloud, names=names))
 
 
 def beside(path: Path) -> Path:
@@ -149,8 +148,8 @@ def points_of(path: Path, cloud: Cloud) -> Points:
     ending = scan_ending(path.name)
     with reading_errors(path):
         points = cloud.points(raw=ending in _ROWS)
-        if cloud.names is not None:
-            warn_of_unused(path, cloud.aliases or cloud.names, cloud.columns, points)
+        if cloud.named:
+            warn_of_unused(path, cloud.meanings, cloud.columns, points)
     if points.dropped:
         kind = f"points that are NaN, infinite or beyond {FARTHEST:g} m are dropped"
         warn_odd(path, kind, points.dropped)
@@ -241,22 +240,17 @@ def write_points(
     replaced. `ring`, each point's beam, is only for .ply.
     """
     path = Path(path)
-    ending = path.suffix.lower()
-    writable = ending in PLAIN and scan_ending(path.name) == ending
-    if not writable or (ending == ".bin" and reflectance is None):
-        formats = ", ".join(PLAIN)
-        raise InputError(f"{path}: scans are written as {formats}; .bin only with a reflectance.")
-    columns = dict(zip("xyz", xyz.T, strict=True))
-    if reflectance is not None:
-        columns["intensity"] = reflectance
-    if ring is not None:
-        columns["ring"] = ring
+    ending = scan_ending(path.name)
+    check(
+        ending in PLAIN and (ending != ".bin" or reflectance is not None),
+        f"{path}: scans are written as {', '.join(PLAIN)}; .bin only with a reflectance.",
+    )
+    fields = {**dict(zip("xyz", xyz.T, strict=True)), "intensity": reflectance, "ring": ring}
     with np.errstate(over="ignore"):  # float32 overflow is infinite
-        table = np.column_stack([*columns.values()]).astype("<f4")
-    assert np.isfinite(table).all(), "a coordinate or reflectance is NaN or infinite"
-    names = tuple(columns)
-    named = ending in (".pcd", ".ply")
-    write_cloud(path, Cloud(names if named else None, tuple(table.T), names, held=len(names)))
+        columns = {name: v.astype("<f4") for name, v in fields.items() if v is not None}
+    finite = all(np.isfinite(column).all() for column in columns.values())
+    assert finite, "a coordinate or reflectance is NaN or infinite"
+    write_cloud(path, Cloud(tuple(columns), tuple(columns.values()), held=len(columns)))
 
 
 def write_cloud(path: Path, cloud: Cloud) -> None:
@@ -271,12 +265,11 @@ def write_cloud(path: Path, cloud: Cloud) -> None:
     ending = scan_ending(path.name)
     with naming(path):
         check(ending in WRITTEN, f"scans are written as {', '.join(WRITTEN)}.")
-        rows = cloud.array() if cloud.names is None else None
-        if rows is not None and ending in (".pcd", ".ply"):  # these name their fields
-            cloud = replace(Cloud.of(rows), header=cloud.header)
-        others = () if cloud.names or rows is None else (rows.dtype.names or ())[cloud.held :]
-        if rows is not None and others:
-            fields: Any = {name: rows[name] for name in others}
+        if ending in (".pcd", ".ply"):  # these name their fields
+            cloud = replace(cloud, held=None)
+        if not cloud.named and len(cloud.columns) > (cloud.held or 0):
+            others = slice(cloud.held, None)
+            fields: Any = dict(zip(cloud.names[others], cloud.columns[others], strict=True))
             with atomic_write(beside(path)) as file:
                 np.savez_compressed(file, **fields)
         with atomic_write(path) as file:

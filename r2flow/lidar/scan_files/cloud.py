@@ -19,12 +19,12 @@ class Cloud:
     A reader of a format, or of a message, makes it; `points` are what r2flow understands of it.
     """
 
-    names: tuple[str, ...] | None  # of the fields; None: the format stores no names, as a .bin
+    names: tuple[str, ...]  # of the fields; of rows without names those that say what they are
     columns: tuple[ndarray, ...]  # (N,) or (N, count) each, of the stored type and byte order
-    aliases: tuple[str, ...] = ()  # names that say what the fields are; (): `names`
+    aliases: tuple[str, ...] = ()  # names that say what the fields are, if others than `names`
     shape: tuple[int, int] | None = None  # (height, width) of an organised cloud, else None
     header: Any = None  # what a writer of the format needs besides: PCD's viewpoint, LAS's header
-    held: int | None = None  # without names: how many fields the rows of the format hold
+    held: int | None = None  # how many fields the rows hold of a format without names, as a .bin
 
     def __len__(self) -> int:
         return len(self.columns[0]) if self.columns else 0
@@ -36,21 +36,28 @@ class Cloud:
         """
         if array.dtype.names is None:
             names = ("x", "y", "z", "reflectance")[: array.shape[1]]
-            return cls(None, tuple(array.T), names, held=len(names))
+            return cls(names, tuple(array.T), held=len(names))
         shape = array.shape if array.ndim == 2 else None
         rows = array.ravel()
         return cls(array.dtype.names, tuple(rows[name] for name in array.dtype.names), (), shape)
 
+    @property
+    def named(self) -> bool:
+        """Whether its format stores the names of the fields."""
+        return self.held is None
+
+    @property
+    def meanings(self) -> tuple[str, ...]:
+        """Names that say what the fields are."""
+        return self.aliases or self.names
+
     def array(self) -> ndarray:
-        """All fields as a structured array, (N,), with packed rows; fields without names have those
-        that say what they are.
+        """All fields as a structured array, (N,), with packed rows.
 
         Raises:
             InputError: Two fields have one name, so that one would be lost.
         """
-        names = self.names or tuple(
-            f"_{place}" if name == "_" else name for place, name in enumerate(self.aliases)
-        )
+        names = [f"_{place}" if name == "_" else name for place, name in enumerate(self.names)]
         for name in names:
             if names.count(name) > 1:
                 raise InputError(f"it has two fields of the name {name}: rename one.")
@@ -67,12 +74,11 @@ class Cloud:
         """The cloud whose fields are understood by a user's renames, as `intensities=reflectance`;
         see `read_points`.
         """
-        names = self.aliases or self.names or ()
-        return replace(self, aliases=tuple(renamed(names, columns)))
+        return replace(self, aliases=tuple(renamed(self.meanings, columns)))
 
     def place(self, role: str) -> int | None:
         """The number of the field that is used of a role, a key of `points.ROLES`; None: none."""
-        places = places_of(self.aliases or self.names or (), role)
+        places = places_of(self.meanings, role)
         filled = [place for place in places if self.columns[place].any()]
         return next(iter(filled or places), None)
 
@@ -83,7 +89,7 @@ class Cloud:
 
     def points(self, raw: bool = False) -> Points:
         """What r2flow understands of the rows that are points (`column_points`), with the cloud."""
-        found = column_points(self.aliases or self.names or (), self.columns, raw)
+        found = column_points(self.meanings, self.columns, raw)
         return replace(found, cloud=self)
 
     def measured(self) -> "Cloud":
@@ -112,14 +118,12 @@ class Cloud:
 
     def with_fields(self, fields: Mapping[str, ndarray]) -> "Cloud":
         """The cloud with further fields after its own, which replace those of the same name."""
-        own = self.names or self.aliases
-        kept = [i for i, name in enumerate(own) if name not in fields]
-        aliases = self.aliases or own
+        kept = [place for place, name in enumerate(self.names) if name not in fields]
         return replace(
             self,
-            names=self.names and (*(self.names[i] for i in kept), *fields),
-            columns=(*(self.columns[i] for i in kept), *fields.values()),
-            aliases=(*(aliases[i] for i in kept), *fields),
+            names=(*(self.names[place] for place in kept), *fields),
+            columns=(*(self.columns[place] for place in kept), *fields.values()),
+            aliases=(*(self.meanings[place] for place in kept), *fields),
         )
 
 

@@ -49,43 +49,47 @@ def read_pcd(path: Path) -> Cloud:
     text, body = _split_header(data)
     header = {line.split()[0]: line.split()[1:] for line in text.splitlines() if line.strip()}
     declared = header.get("FIELDS") or header["COLUMNS"]
-    counts = map(int, header.get("COUNT", ["1"] * len(declared)))
-    names: list[str] = []
-    kinds: list[tuple[str, str, tuple[int, ...]]] = []
-    for name, kind, size, width in zip(
-        declared, header["TYPE"], header["SIZE"], counts, strict=True
-    ):
-        if width:
-            number = str(len(names))  # names may repeat
-            kinds.append((number, f"<{kind.lower()}{size}", (width,) if width > 1 else ()))
-            names.append(name)
-    row = np.dtype(kinds)
+    counts = header.get("COUNT", ["1"] * len(declared))
+    fields = zip(declared, header["TYPE"], header["SIZE"], map(int, counts), strict=True)
+    stored = [field for field in fields if field[3]]
+    row = np.dtype(
+        [
+            (
+                str(number),
+                f"<{kind.lower()}{size}",
+                (width,) if width > 1 else (),
+            )  # names may repeat
+            for number, (_, kind, size, width) in enumerate(stored)
+        ]
+    )
     sizes = header.get("POINTS") or header["WIDTH"] + header["HEIGHT"]
     count = math.prod(map(int, sizes))
     encoding = header["DATA"][0]
+    if encoding == "binary_compressed":
+        columns = _decompressed(path, body, row, count)
+    else:
+        columns = _columns(body, row, count, encoding)
     wide, high = (int(header.get(key, ["0"])[0]) for key in ("WIDTH", "HEIGHT"))
-    grid = (high, wide) if high > 1 and high * wide == count else None
+    kept = [place for place, (name, *_) in enumerate(stored) if name != PADDING]
+    return Cloud(
+        tuple(stored[place][0] for place in kept),
+        tuple(columns[place] for place in kept),
+        shape=(high, wide) if high > 1 and high * wide == count else None,
+        header=header.get("VIEWPOINT"),
+    )
 
-    def cloud(columns: list[ndarray]) -> Cloud:
-        kept = [place for place, name in enumerate(names) if name != PADDING]
-        return Cloud(
-            tuple(names[place] for place in kept),
-            tuple(columns[place] for place in kept),
-            shape=grid,
-            header=header.get("VIEWPOINT"),
-        )
 
-    if encoding != "binary_compressed":
-        return cloud(_columns(body, row, count, encoding))
+def _decompressed(path: Path, body: bytes, row: np.dtype, count: int) -> list[ndarray]:
+    """The columns of a compressed body: all x, then all y, ..."""
     require(str(path), "formats", "lzf")
     from lzf import decompress
 
     stored, size = struct.unpack_from("<II", body)
     if size != count * row.itemsize or body[8 + stored :].strip(b"\0"):
         raise InputError("its header declares another size than its data. Is it damaged?")
-    blocks = decompress(body[8 : 8 + stored], size)  # all x, then all y, ...
+    blocks = decompress(body[8 : 8 + stored], size)
     fields = (row.fields or {}).values()
-    return cloud([np.frombuffer(blocks, kind, count, count * at) for kind, at, *_ in fields])
+    return [np.frombuffer(blocks, kind, count, count * at) for kind, at, *_ in fields]
 
 
 def write_pcd(file: IO[bytes], cloud: Cloud) -> None:

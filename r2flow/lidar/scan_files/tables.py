@@ -3,6 +3,7 @@
 import io
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +12,10 @@ from typing import IO
 import numpy as np
 from numpy import ndarray
 
-from r2flow.base.errors import InputError, require
+from r2flow.base.errors import InputError, check, require
 from r2flow.lidar.scan_files.cloud import Cloud
 from r2flow.lidar.scan_files.points import is_renaming, role_of
-from r2flow.lidar.scan_files.widths import are_metres, fits_width, fitting_widths
+from r2flow.lidar.scan_files.widths import fits_width, fitting_widths
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,9 @@ class TextForm:
 
 _NUMBER = re.compile(r"(^|[;,\s])[-+]?(\.?\d|nan\b|inf\b)", re.IGNORECASE)
 LARGEST = 1 << 30  # bytes of the points of a compressed file
+_KITTI = ("x", "y", "z", "reflectance")
+_NUSCENES = ("x", "y", "z", "intensity", "ring")
+_NPY = np.lib.format.MAGIC_PREFIX[:4]
 WIDEST = 32  # columns of points; a wider array is an image
 _UNIT = re.compile(r"\s*[\[(](?!([cmk]m|ft)\b).*")  # other units than metres stay: not a known name
 
@@ -37,46 +41,47 @@ def read_rows(path: Path, columns: Sequence[str] | None) -> Cloud:
     Raises:
         InputError: The file is not made of such rows, or without `columns` of others.
     """
-    width = 5 if path.name.lower().endswith(".pcd.bin") else 4
+    names: Sequence[str] = _NUSCENES if path.name.lower().endswith(".pcd.bin") else _KITTI
     if columns is not None:
-        width = len(usual_names(len(columns), columns))
-    size = path.stat().st_size
+        names = column_names(len(columns), columns)
+    width = len(names)
+    left = path.stat().st_size % (4 * width)
     values = np.fromfile(path, "<f4")
-    if values[:1].tobytes() == np.lib.format.MAGIC_PREFIX[:4]:
-        raise InputError("it is a .npy file: rename it.")
-    left = size % (4 * width)
-    if left or not (columns or (fits_width(values, width) and are_metres(values, width))):
-        fitting = fitting_widths(values)
-        if len(fitting) == 1 and fitting != [width]:
-            names = ["x", "y", "z", "intensity", *"_" * WIDEST][: fitting[0]]
-            raise InputError(
-                f"it is made of rows of {fitting[0]} float32, not {width}: name all by --columns "
-                f"{','.join(names)} (_ for what is not used)."
-            )
-        for kind in ("float64", "float16") if not fitting else ():
-            with np.errstate(invalid="ignore", over="ignore"):  # of numbers that are none
-                others = fitting_widths(np.fromfile(path, kind))
-            if others:
-                raise InputError(
-                    f"it is made of rows of {others[0]} {kind}, not float32: convert it, as "
-                    f"numpy.fromfile(FILE, '{kind}').astype('float32').tofile(OTHER)."
-                )
+    check(values[:1].tobytes() != _NPY, "it is a .npy file: rename it.")
+    if left or not (columns or fits_width(values, width)):
+        _refuse_other_rows(path, width)
     if left:
         raise InputError(
             f"it is not made of rows of {width} float32: {left} bytes are left. Is it cut short, "
             "or of other columns (--columns x,y,z,intensity,ring)?"
         )
-    named = columns or (("x", "y", "z", "intensity", "ring") if width == 5 else None)
-    known = tuple(usual_names(width, named))
-    return Cloud(None, tuple(values.reshape(-1, width).T), known, held=width)
+    return Cloud(tuple(names), tuple(values.reshape(-1, width).T), held=width)
+
+
+def _refuse_other_rows(path: Path, width: int) -> None:
+    """Refuse a file if rows of another width, or of other floats, are the only ones that fit."""
+    fitting = fitting_widths(np.fromfile(path, "<f4"))
+    if len(fitting) == 1 and fitting != [width]:
+        names = ["x", "y", "z", "intensity", *"_" * WIDEST][: fitting[0]]
+        raise InputError(
+            f"it is made of rows of {fitting[0]} float32, not {width}: name all by --columns "
+            f"{','.join(names)} (_ for what is not used)."
+        )
+    others = {"<f8": "float64", "<f2": "float16", ">f4": "big-endian float32"}
+    for kind, named in {} if fitting else others.items():
+        if widths := fitting_widths(np.fromfile(path, kind)):
+            raise InputError(
+                f"it is made of rows of {widths[0]} {named}, not float32: convert it, as "
+                f"numpy.fromfile(FILE, '{kind}').astype('<f4').tofile(OTHER)."
+            )
 
 
 def read_array(path: Path) -> ndarray:
     """The array of numbers in a .npy, without unpickling or allocating what a header declares."""
     with np.errstate(over="raise"):
         mapped = np.lib.format.open_memmap(path, mode="r")
-    if mapped.offset + mapped.nbytes != path.stat().st_size:
-        raise InputError(f"it is longer than its header declares: {mapped.shape}. Is it damaged?")
+    whole = mapped.offset + mapped.nbytes == path.stat().st_size
+    check(whole, f"it is longer than its header declares: {mapped.shape}. Is it damaged?")
     return np.array(mapped)
 
 
@@ -91,13 +96,14 @@ def read_npy(path: Path) -> Cloud:
             "(N, 4). Range images are floats (2, H, W), range in metres and reflectance, or "
             "(1, H, W)."
         )
-    return Cloud(None, tuple(array.T))
+    return Cloud((), tuple(array.T), held=array.shape[1])
 
 
 def read_text(path: Path) -> Cloud:
     """A point per line, separated by commas, semicolons, tabs or spaces.
 
-    Names stand in the first line, or in the comment before it.
+    Names stand in the first line, or in the comment before it. Columns without decimal points are
+    integers, but for coordinates.
     """
     text = path.read_text("utf-8-sig", "replace").replace('"', "")
     lines = [line.strip(" \r") for line in text.split("\n") if line.strip()]
@@ -126,35 +132,21 @@ def read_text(path: Path) -> Cloud:
     width = table.shape[1]
     form = TextForm(separator or " ", head[: len(head) - len(head.lstrip("#/ "))])
     if in_comment and (len(words) != width or not any(map(role_of, names))):
-        return Cloud(None, tuple(table.T), header=form)
+        return Cloud((), tuple(table.T), header=form, held=width)
     if len(words) < width and not np.isnan(table[:, -1]).all():
         raise InputError("rows are longer than the names.")
-    known = tuple(names[:width])
-    columns = _columns_of(table, rows, separator, known)
-    return Cloud(stored[:width], columns, known, header=form)
+    columns = [*table.T][: len(names)]  # without those of separators at the end
+    for place, (name, column) in enumerate(zip(names, columns, strict=False)):
+        if not _is_axis(name) and (column % 1 == 0).all():
+            with suppress(ValueError):  # a number has a decimal point
+                columns[place] = np.loadtxt(
+                    rows, np.int64, delimiter=separator, comments=None, usecols=place, ndmin=1
+                )
+    return Cloud(stored[:width], tuple(columns), tuple(names[:width]), header=form)
 
 
-def _columns_of(
-    table: ndarray, rows: Sequence[str], separator: str | None, names: Sequence[str]
-) -> tuple[ndarray, ...]:
-    """The columns of a text: of integers, if all are, but for coordinates. Those that float64 would
-    round, as nanoseconds, are read again.
-    """
-    columns = [*table.T]
-    words = rows[0].split(separator)
-    del columns[len(names) :]  # of separators at the end
-    for place, (column, word, name) in enumerate(zip(columns, words, names, strict=False)):
-        if role_of(name) in ("x", "y", "z") or not word.strip(" +-").isdigit():
-            continue
-        if not (column % 1 == 0).all():
-            continue
-        if abs(column).max() < 2**53:
-            columns[place] = column.astype(np.int64)
-        else:
-            columns[place] = np.loadtxt(
-                rows, np.int64, delimiter=separator, comments=None, usecols=place, ndmin=1
-            )
-    return tuple(columns)
+def _is_axis(name: str) -> bool:
+    return role_of(name) in ("x", "y", "z")
 
 
 def read_arrow(path: Path) -> Cloud:
@@ -214,14 +206,14 @@ READERS = {
 }
 
 
-def usual_names(width: int, columns: Sequence[str] | None) -> Sequence[str]:
+def column_names(width: int, columns: Sequence[str] | None) -> Sequence[str]:
     """Names of the columns of a file without names.
 
     They are `columns`, else x, y, z and, for four columns, reflectance.
     """
     if is_renaming(columns):
         raise InputError("it does not name its columns: name all, as --columns x,y,z,intensity.")
-    names = columns or ("x", "y", "z", "reflectance")[: max(width, 3)]
+    names = columns or _KITTI[: max(width, 3)]
     if len(names) != width:
         named = ",".join(["x", "y", "z", "intensity", *"_" * width][: max(width, 3)])
         raise InputError(
@@ -260,28 +252,31 @@ def write_arrow(file: IO[bytes], cloud: Cloud, ending: str) -> None:
     import pyarrow
     from pyarrow import feather, parquet
 
-    names = cloud.names or cloud.aliases
     types = {field.name: field.type for field in cloud.header}
     arrays = [
         pyarrow.array(column, types.get(name), from_pandas=column.dtype.kind != "f")
-        for name, column in zip(names, cloud.columns, strict=True)
+        for name, column in zip(cloud.names, cloud.columns, strict=True)
     ]
-    table = pyarrow.table(arrays, names).replace_schema_metadata(cloud.header.metadata)
+    table = pyarrow.table(arrays, cloud.names).replace_schema_metadata(cloud.header.metadata)
     (feather.write_feather if ending == ".feather" else parquet.write_table)(table, file)
 
 
 def write_text(file: IO[bytes], cloud: Cloud) -> None:
-    """Write a line per point, each number with as many digits as give it back, below the names."""
+    """Write a line per point, each number with as many digits as give it back, below the names.
+
+    Whole floats have a decimal point where `read_text` would take them for integers.
+    """
     form = cloud.header
-    if cloud.names is not None:
+    if cloud.named:
         file.write(f"{form.prefix}{form.separator.join(cloud.names)}\n".encode())
-    columns = [map(_digits, column.tolist()) for column in cloud.columns[: cloud.held]]
+    columns = []
+    for name, column in zip(cloud.meanings, cloud.columns[: cloud.held], strict=False):
+        digits = [*map(repr, column.tolist())]
+        if not cloud.named or _is_axis(name):
+            digits = [number.removesuffix(".0") for number in digits]
+        columns.append(digits)
     lines = map(form.separator.join, zip(*columns, strict=True))
     file.writelines(f"{line}\n".encode() for line in lines)
-
-
-def _digits(value: float) -> str:
-    return repr(value).removesuffix(".0")
 
 
 def write_rows(file: IO[bytes], cloud: Cloud) -> None:
@@ -291,10 +286,8 @@ def write_rows(file: IO[bytes], cloud: Cloud) -> None:
 
 def write_npy(file: IO[bytes], cloud: Cloud) -> None:
     """Write named fields, or rows without names, of the types that were read."""
-    if cloud.names is not None:
+    if cloud.named:
         np.save(file, cloud.array())
         return
-    columns = cloud.columns[: cloud.held]
-    rows = np.empty((len(cloud), len(columns)), columns[0].dtype)
-    rows.T[:] = columns
-    np.save(file, rows)
+    kind = cloud.columns[0].dtype
+    np.save(file, np.stack(cloud.columns[: cloud.held], axis=1).astype(kind))
