@@ -218,9 +218,7 @@ def points(r2flow, real, tmp_path):
             "--no-baselines",
         )
         assert r2flow("evaluate", real, *arguments, *options, "--out", tmp_path).said
-        return read_results([tmp_path / "evaluation.json"]), (
-            tmp_path / "evaluation.md"
-        ).read_text()
+        return read_results(tmp_path / "evaluation.json"), (tmp_path / "evaluation.md").read_text()
 
     return measure
 

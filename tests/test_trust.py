@@ -15,6 +15,7 @@ from r2flow.lidar.sensors import read_sensor, write_sensor
 from r2flow.model.completion import complete
 from r2flow.reports.calibration import TASKS, trust_of
 from r2flow.reports.completion import kept_rays
+from r2flow.simulator import simulate
 from tests.test_completion import halved, network
 from tests.test_sampling import scans
 
@@ -151,3 +152,22 @@ def test_errors_times_the_factors_that_were_found_hold_the_truth_of_these_scans(
             inside.append((error <= one.error(0.68, 0.95)[:, 0] * (1 + 1e-5))[:, right])
     shares = torch.cat(inside, 1).float().mean(1)
     assert shares.tolist() == pytest.approx([0.68, 0.95], abs=2 / found.points)
+
+
+def test_calibrate_writes_the_factors_into_the_file_of_the_sensor(r2flow, tmp_path, monkeypatch):
+    monkeypatch.setattr("r2flow.reports.calibration._FEWEST", 100)
+    flow = network()
+    flow.save(tmp_path / "tiny.safetensors")
+    path = tmp_path / "mine.yaml"
+    write_sensor(replace(flow.sensor, name="mine"), path, "of my own")
+    for _ in range(2):  # a second time replaces the factors and what is said of them
+        said = r2flow(
+            "calibrate", "simulated:1", "--sensor", path, "-c", tmp_path / "tiny.safetensors", "--num", 2
+        ).said  # fmt: skip
+    mine = read_sensor(path)
+    factors = mine.error_factors
+    assert f"error_factors [{factors[0]:.3f}, {factors[1]:.3f}] in {path}" in said
+    images = [one.image for one in (simulate(mine, 1, number) for number in (250, 750))]
+    assert factors == trust_of(flow.through(mine), images).factors
+    said, about, *_ = path.read_text().splitlines()
+    assert (said, about) == ("# of my own", "# error_factors: r2flow calibrate, tiny, 2 scans")

@@ -16,9 +16,11 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from r2flow.backbones import Backbone, build_backbone, configurations
 from r2flow.base.errors import InputError
+from r2flow.base.progress import track
 from r2flow.generators import build_generator
 from r2flow.lidar.sensors import Sensor
-from r2flow.reports.tables import Row, print_table
+from r2flow.reports.pages import Page
+from r2flow.reports.tables import Part, Row, Table
 
 T = TypeVar("T")
 
@@ -27,6 +29,14 @@ RULE = (
     "norm; "
     "scaled_dot_product_attention's products left out, as in the paper's table II"
 )
+
+_COLUMNS = {
+    "name": "backbone",
+    "parameters": "parameters",
+    "gmac": "GMAC",
+    "latency_ms": "latency, ms",
+    "error": "",
+}
 
 ATEN = torch.ops.aten
 # Two operations a multiply-accumulate, as torch's counter.
@@ -107,6 +117,19 @@ def count_macs(model: Backbone) -> int:
     return counter.get_total_flops() // 2 + sum(stated)
 
 
+def report_backbones(
+    sensor: Sensor, names: Sequence[str] | None = None, repeats: int = 3, device: str = "cpu"
+) -> Page:
+    """The page of `backbone_costs`."""
+    names = names or list(configurations())
+    costs = backbone_costs(sensor, names, repeats, device)
+    rows = list(track(costs, "measuring", "backbones", total=len(names)))
+    size = " x ".join(map(str, sensor.shape))
+    table = Table(rows, _COLUMNS, f"{size}, batch 1, float32, {device}")
+    text: list[Part] = [table, f"GMAC: {RULE}."]
+    return Page("backbones", "Cost of backbones", text, rows, device=device)
+
+
 def backbone_costs(
     sensor: Sensor, names: Sequence[str] | None = None, repeats: int = 3, device: str = "cpu"
 ) -> Iterator[Row]:
@@ -164,17 +187,3 @@ def timed(call: Callable[[], T], device: torch.device | str = "cpu") -> tuple[T,
     result = call()
     wait(device)
     return result, time.perf_counter() - begin
-
-
-def print_costs(rows: Sequence[Row], sensor: Sensor, device: str) -> None:
-    """Print rows of `backbone_costs`."""
-    columns = {
-        "name": "backbone",
-        "parameters": "parameters",
-        "gmac": "GMAC",
-        "latency_ms": "latency, ms",
-        "error": "",
-    }
-    size = " x ".join(map(str, sensor.shape))
-    print_table(rows, columns, f"{size}, batch 1, float32, {device}")
-    print(f"GMAC: {RULE}.")

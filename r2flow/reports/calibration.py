@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +11,15 @@ import torch
 from numpy import ndarray
 
 from r2flow.base.errors import check
+from r2flow.base.progress import Bar
 from r2flow.generators import TransferFlow
 from r2flow.generators.base import Progress
 from r2flow.lidar.known import ray_states
+from r2flow.lidar.sensors import read_sensor, write_sensor
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import complete
+from r2flow.model.inversion import real_scans
+from r2flow.model.paths import title_of
 from r2flow.reports.completion import kept_rays
 from r2flow.samplers import Jump
 
@@ -30,6 +35,29 @@ class Trust(NamedTuple):
     factors: tuple[float, float]
     shares: tuple[float, float]
     points: int
+
+
+def calibrate(
+    model: Checkpoint,
+    real: str,
+    sensor: Path,
+    num: int = 16,
+    reflectance_scale: float | None = None,
+) -> Trust:
+    """Write the factors of `trust_of` on at most `num` scans into the YAML file of their sensor,
+    which keeps its comment.
+    """
+    plain = read_sensor(sensor)
+    flow = model.through(plain)
+    _, images = real_scans(flow, [real], reflectance_scale, num, need_reflectance=False)
+    with Bar("completing", len(images) * len(TASKS), "evaluations") as advance:
+        trust = trust_of(flow, [*images.numpy()], advance)
+    lines = sensor.read_text(encoding="utf-8").splitlines()
+    said = [line for line in lines if line.startswith("#") and "error_factors" not in line]
+    about = f"error_factors: r2flow calibrate, {title_of(model.path)}, {len(images)} scans"
+    comment = "\n".join(line.removeprefix("#").strip() for line in [*said[:-1], about])
+    write_sensor(replace(plain, error_factors=trust.factors), sensor, comment)
+    return trust
 
 
 def trust_of(model: Checkpoint, truths: Sequence[ndarray], progress: Progress = None) -> Trust:

@@ -4,14 +4,15 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
+from os.path import commonprefix
 from pathlib import Path
 from statistics import fmean, stdev
 
 from r2flow.base.config import flatten
 from r2flow.model.config import learned
 from r2flow.reports.pages import Page
-from r2flow.reports.runs import ComparedRun
-from r2flow.reports.tables import Row, Table, latex, print_table
+from r2flow.reports.runs import ComparedRun, read_runs
+from r2flow.reports.tables import Part, Row, Table
 from r2flow.reports.training import curves_figure
 from r2flow.runs.folder import read_config
 
@@ -34,14 +35,21 @@ _RESULTS = {
 
 _NOTES = (
     "Losses are those that were logged: of validation, with the averaged weights; compare them "
-    "only between runs with "
-    "the same loss and the same data. Bend is the last `curvature/bend`, s(t) over the squared "
-    "path length; an "
-    "untrained flow is straight too. Several seeds: mean ± standard deviation."
+    "only between runs with the same loss and the same data. Bend is the last `curvature/bend`, "
+    "s(t) over the squared path length; an untrained flow is straight too. Several seeds: mean ± "
+    "standard deviation."
 )
 
 
 Groups = Mapping[str, Sequence[ComparedRun]]  # by label: runs that differ only in their seed
+
+
+def report_runs(folders: Sequence[Path], group: bool = False) -> Page:
+    """The page of some runs, or of the runs in folders of runs (a chain, a sweep); `group` joins
+    those that differ only in their seed.
+    """
+    runs = read_runs(folders)
+    return compare_page(group_runs(runs) if group else {run.label: [run] for run in runs})
 
 
 def group_runs(runs: Sequence[ComparedRun]) -> Groups:
@@ -55,38 +63,30 @@ def group_runs(runs: Sequence[ComparedRun]) -> Groups:
         name = group[0].label
         if len(group) > 1:
             seeds = r"[-_.,/= ]*seed[-_.= ]*\d+[-_.,/= ]*|-\w{6}$"
-            alike = _shared([re.sub(seeds, "", run.label) for run in group])
+            alike = commonprefix([re.sub(seeds, "", run.label) for run in group])  # noqa: RUF071
             name = alike.rstrip("-_.,/= ") or group[0].values["stage"]
         named[f"{name} ({len(named)})" if name in named else name] = group
     return named
 
 
-def _shared(names: Sequence[str]) -> str:
-    """The longest beginning of some names."""
-    first, last = min(names), max(names)
-    differ = (n for n, (a, b) in enumerate(zip(first, last, strict=False)) if a != b)
-    return first[: next(differ, len(first))]
-
-
 def configuration(config: Row) -> str:
     """Settings of a run and its ancestors that affect the result, without seeds, as text."""
-    settings = dict(flatten(learned(config)))
     ignored = ["seed"]
     if config["data"]["name"] == "pairs":  # their parent differs between seeds
         ignored += ["data.pairs.parent", "scans"]
-    kept = {
+    settings = {
         key: value
-        for key, value in settings.items()
+        for key, value in flatten(learned(config))
         if key not in ignored and not key.startswith("stage.parent.")
     }
-    given = dict(flatten(config))  # a run may resume with other values of these
+    values = dict(flatten(config))  # a run may resume with other values of these
     for key in ("trainer.precision", "stage.parent.step", "data.pairs.of"):
-        kept[key] = given.get(key)
+        settings[key] = values.get(key)
     parent = config["stage"].get("parent")
     if parent:
         before = read_config(Path(parent["path"]).parent.parent)
-        kept["parent"] = configuration(before) if before else parent["weights"]
-    return json.dumps(kept, sort_keys=True, default=str)
+        settings["parent"] = configuration(before) if before else parent["weights"]
+    return json.dumps(settings, sort_keys=True, default=str)
 
 
 def _group_rows(groups: Groups) -> list[Row]:
@@ -122,58 +122,27 @@ def cell(row: Row, column: str) -> str:
     return text if spread is None else f"{text} ± {spread:.3g}"
 
 
-def _tables(groups: Groups) -> dict[str, tuple[list[Row], dict[str, str]]]:
-    """Rows of text and headings by title: settings of the runs, and results."""
+def compare_page(groups: Groups) -> Page:
+    """Build the page of a comparison: tables, curves, and which losses cannot be compared."""
+    members = [(label, run) for label, runs in groups.items() for run in runs]
     rows = _group_rows(groups)
-    text = [{key: cell(row, key) for key in row} for row in rows]
-    measured = {
-        key: heading
-        for key, heading in _RESULTS.items()
-        if any(row[key] is not None for row in rows)
-    }
-    name = {"name": "run"}
-    return {"Runs": (text, {**name, "n": "n", **_SETTINGS}), "Results": (text, name | measured)}
-
-
-def print_comparison(groups: Groups, tex: bool = False) -> None:
-    """Print the tables, for a terminal or in LaTeX, and which runs cannot be compared by their
-    losses.
-    """
-    for title, (rows, columns) in _tables(groups).items():
-        if tex:
-            print(f"% {title}\n{latex(rows, columns)}")
-            continue
-        print_table(rows, columns, title)
-        print()
-    if tex:
-        return
-    runs = [run.values for group in groups.values() for run in group]
+    cells = [{key: cell(row, key) for key in row} for row in rows]
+    measured = {key: _RESULTS[key] for key in _RESULTS if any(row[key] is not None for row in rows)}
+    text: list[Part] = [
+        Table(cells, {"name": "run", "n": "n", **_SETTINGS}, "Runs"),
+        Table(cells, {"name": "run", **measured}, "Results"),
+    ]
     compared = ("images", "stage", "loss", "data")
-    differ = [key for key in compared if len({str(run[key]) for run in runs}) > 1]
+    differ = [key for key in compared if len({str(run.values[key]) for _, run in members}) > 1]
     if differ:
-        print(
+        text.append(
             f"the runs differ in {', '.join(differ)}: compare them at equal steps, or by r2flow "
             "evaluate, not by their losses"
         )
-
-
-def compare_page(groups: Groups) -> Page:
-    """Build the page of a comparison: tables and curves."""
-    members = [(label, run) for label, runs in groups.items() for run in runs]
-    seeds = {run.label: int(run.config["seed"]) for _, run in members if "seed" in run.config}
-    text = []
-    for title, (rows, columns) in _tables(groups).items():
-        text.append(Table(rows, columns, title))
     figures = {}
     if any(run.curves for _, run in members):
         figures["compare"] = curves_figure([(label, run.curves) for label, run in members])
+    seeds = {run.label: int(run.config["seed"]) for _, run in members if "seed" in run.config}
     each = [{"group": label, "run": run.label, **run.values} for label, run in members]
-    return Page(
-        "compare",
-        "Runs compared",
-        [*text, _NOTES],
-        _group_rows(groups),
-        figures,
-        seeds,
-        more={"runs": each},
-    )
+    title = "Runs compared"
+    return Page("compare", title, text, rows, figures, seeds, more={"runs": each}, details=[_NOTES])

@@ -1,18 +1,19 @@
 """Straightness of the paths of trained flows: the paper's figure 8."""
 
 import logging
-from collections.abc import Mapping
-from pathlib import Path
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
 
 from r2flow.base.noise import Draws
+from r2flow.base.progress import Bar
 from r2flow.flow.straightness import Straightness, straightness
 from r2flow.generators import as_flow
 from r2flow.generators.base import Progress
-from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.reports.figures import Plot, blank_figure, lines_figure
 from r2flow.reports.pages import Page
 from r2flow.reports.tables import Part, Row, Table, short_names
@@ -27,6 +28,32 @@ _COLUMNS = {
 Flows = Mapping[str, Straightness]  # by label
 
 _TIME = "t  (0 noise, 1 data)"
+
+
+def report_curvature(
+    models: Sequence[str],
+    num: int = 4,
+    steps: int = 256,
+    seed: int = 0,
+    batch_size: int = 1,
+    device: str = "cpu",
+) -> Page:
+    """The page of the straightness of trained flows, by name, along paths of `steps` Euler steps of
+    scans 0 to num - 1 of a seed.
+
+    Raises:
+        InputError: a model that is no flow from noise.
+    """
+    loaded = {name: load_checkpoint(name, device) for name in dict.fromkeys(models)}
+    for name, checkpoint in loaded.items():
+        as_flow(checkpoint.generator, f"{name}: curvature")
+    evaluations = len(loaded) * math.ceil(num / batch_size) * steps
+    with Bar("measuring", evaluations, "evaluations") as advance:
+        flows = {
+            name: measure_paths(checkpoint, name, num, steps, seed, batch_size, progress=advance)
+            for name, checkpoint in loaded.items()
+        }
+    return curvature_page(flows, seed, device)
 
 
 def measure_paths(
@@ -110,7 +137,7 @@ def trajectories_figure(flows: Flows) -> Figure:
     """Plot the most curved paths, one panel per checkpoint: the paper's figure 8 (b)."""
     figure = blank_figure(1 + 4.2 * len(flows), 4.2)
     panels = figure.subplots(1, len(flows), sharey=True, squeeze=False)[0]
-    titles = short_names([Path(label) for label in flows])
+    titles = short_names(list(flows))
     for axes, flow, title in zip(panels, flows.values(), titles, strict=True):
         t = np.append(flow.t, 1.0)
         axes.plot(t, flow.trajectories.T.numpy(), lw=0.7, alpha=0.8, color="0.55")

@@ -12,9 +12,10 @@ from matplotlib.figure import Figure
 from r2flow.base.errors import InputError
 from r2flow.base.files import read_json
 from r2flow.base.progress import track
+from r2flow.data.opening import open_scans, reading_for
 from r2flow.data.sets import ScanSet
 from r2flow.generators import Flow
-from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.model.saving import weights_hash
 from r2flow.reports.backbones import cost
 from r2flow.reports.curvature import (
@@ -26,7 +27,7 @@ from r2flow.reports.curvature import (
 from r2flow.reports.evaluation import sampled_rows, speed_figure
 from r2flow.reports.pages import Page
 from r2flow.reports.pictures import contact_sheet
-from r2flow.reports.tables import Part, Row, Table, shown
+from r2flow.reports.tables import Part, Row, Table, short_names, shown
 from r2flow.reports.verdict import PRINTED
 
 _PRINTED = yaml.safe_load(Path(__file__).with_name("printed.yaml").read_text(encoding="utf-8"))
@@ -90,17 +91,23 @@ def role_of(checkpoint: Checkpoint, label: str) -> str:
     return role.format(stage.get("steps"))
 
 
-def paper_page(
-    runs: Sequence[PaperRun],
-    rows: Sequence[Row],
-    real: ScanSet | None,
-    steps: int,
-    device: str,
+def report_paper(
+    models: Sequence[str],
+    results: Sequence[Path] = (),
+    real: str | None = None,
+    steps: int = 256,
+    device: str = "cpu",
 ) -> Page:
-    """Build the page from rows of `read_results`.
+    """The page of the paper's tables and figures.
 
     Figure 7 begins with a scan of `real`, figure 8 has four paths of `steps` Euler steps.
+
+    Args:
+        models: Runs, checkpoint files or models, as MODEL or ROLE=MODEL.
+        results: JSON files of `r2flow evaluate`.
     """
+    rows = [row for file in results for row in read_results(file)]
+    runs = _paper_runs(models, device)
     run_of = {weights_hash(run.checkpoint): run for run in runs}
     evaluated = [
         {**row, "role": run_of[row["weights"]].role} for row in rows if row["weights"] in run_of
@@ -110,17 +117,17 @@ def paper_page(
         raise InputError(
             f"the results are of other models or checkpoints than {names}: evaluate these."
         )
+    scans = real and open_scans(real, reading_for([real], runs[0].checkpoint))
     architectures = _architecture_rows(runs, evaluated, device)
     protocols = "; ".join(dict.fromkeys(row["protocol"] for row in evaluated))
     text: list[Part] = [
         f"Generators: {names}.",
         _table_i(evaluated),
         f"Evaluated rows: {protocols or 'none'}. Printed rows: {_PROTOCOL} kitti_360. Figures with "
-        "* are of another "
-        "protocol than printed ones, and not comparable.",
+        "* are of another protocol than printed ones, and not comparable.",
         Table(architectures, _ARCHITECTURES, "Table II: velocity estimators"),
     ]
-    figures = {"figure_7": _scans_figure(runs, real)}
+    figures = {"figure_7": _scans_figure(runs, scans or None)}
     metrics = [f"{name}/{name}" for name in COLUMNS]
     metrics = [name for name in metrics if any(name in row for row in evaluated)]
     if metrics:
@@ -143,6 +150,23 @@ def paper_page(
     return Page("paper", title, text, evaluated, figures, {"sampled scans": 0}, device, more)
 
 
+def _paper_runs(models: Sequence[str], device: str) -> list[PaperRun]:
+    named = []
+    for text in models:
+        role, equals, model = text.partition("=")
+        named.append((role, model) if equals and not Path(text).exists() else ("", text))
+    labels = short_names([model for _, model in named])
+    runs: list[PaperRun] = []
+    for (role, model), label in zip(named, labels, strict=True):
+        checkpoint = load_checkpoint(model, device)
+        runs.append(PaperRun(role or role_of(checkpoint, label), model, checkpoint))
+        if not checkpoint.generator.unconditional:
+            raise InputError(f"{model} does not generate scans from noise.")
+        if checkpoint.sensor.shape != runs[0].checkpoint.sensor.shape:
+            raise InputError(f"{model} makes images of another size than {runs[0].label}.")
+    return runs
+
+
 def _scans_figure(runs: Sequence[PaperRun], real: ScanSet | None) -> Figure:
     """Figure 7: a real scan, and the first sample of each generator."""
     images = {}
@@ -158,15 +182,12 @@ def _scans_figure(runs: Sequence[PaperRun], real: ScanSet | None) -> Figure:
     return contact_sheet([image[:channels] for image in images.values()], rays, list(images))
 
 
-def read_results(files: Sequence[Path]) -> list[Row]:
-    """One row per sampled set in the JSON files of `r2flow evaluate` (`sampled_rows`)."""
-    rows = []
-    for file in files:
-        try:
-            rows += sampled_rows(read_json(file)["comparisons"])
-        except (OSError, ValueError, LookupError, TypeError, AttributeError):
-            raise InputError(f"{file} is not a JSON file of `r2flow evaluate`.") from None
-    return rows
+def read_results(file: Path) -> list[Row]:
+    """One row per sampled set in a JSON file of `r2flow evaluate` (`sampled_rows`)."""
+    try:
+        return sampled_rows(read_json(file)["comparisons"])
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        raise InputError(f"{file} is not a JSON file of `r2flow evaluate`.") from None
 
 
 def _table_i(rows: Sequence[Row]) -> Table:

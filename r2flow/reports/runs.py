@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
 
-from r2flow.base.errors import InputError, naming
+from r2flow.base.errors import InputError, check, naming
 from r2flow.base.plugins import made_with
 from r2flow.model.paths import checkpoints_of, step_of
 from r2flow.reports.backbones import cost
@@ -32,11 +32,8 @@ def _find_runs(paths: Sequence[Path]) -> list[Path]:
     """
     runs: dict[Path, Path] = {}  # a link and its run are one
     for path in paths:
-        inside = [
-            run.parent for level in ("", "*/", "*/*/") for run in sorted(path.glob(level + CONFIG))
-        ]
-        if path in inside:
-            inside = [path]
+        levels = [""] if (path / CONFIG).exists() else ["*/", "*/*/"]
+        inside = [run.parent for level in levels for run in sorted(path.glob(level + CONFIG))]
         runs |= {
             run.resolve(): run for run in inside if run == path or not run.name.startswith(".")
         }
@@ -56,8 +53,8 @@ def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
     for path, label in zip(folders, short_names(folders), strict=True):
         config = read_config(path) or {}
         whole = {"stage", "backbone", "data", "sensor", "encoding"} <= config.keys()
-        if not whole or "batch_size" not in config["data"]:
-            raise InputError(f"{path / CONFIG} is not the config of a run.")
+        whole = whole and "batch_size" in config["data"]
+        check(whole, f"{path / CONFIG} is not the config of a run.")
         keys = ("sensor", "encoding", "backbone", "generator")
         architecture = json.dumps([config.get(key) for key in keys], sort_keys=True)
         if architecture not in costs:

@@ -2,6 +2,7 @@
 trained flow.
 """
 
+import logging
 import math
 import shlex
 import time
@@ -15,8 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from r2flow.base.errors import InputError
 from r2flow.base.noise import Draws
 from r2flow.base.plugins import loaded_plugins
+from r2flow.base.progress import Bar
 from r2flow.flow.problems import PROBLEMS
 from r2flow.flow.solvers import (
     SOLVERS,
@@ -30,12 +33,11 @@ from r2flow.flow.solvers import (
 from r2flow.generators import as_flow
 from r2flow.generators.base import Progress
 from r2flow.lidar.encoding import Encoding
-from r2flow.model.checkpoint import Checkpoint
+from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.model.inversion import metres_apart, rms
 from r2flow.reports.backbones import timed
 from r2flow.reports.figures import Plot, lines_figure
 from r2flow.reports.pages import Page
-from r2flow.reports.savings import savings_text
 from r2flow.reports.tables import Part, Row, Table, shown
 
 USUAL = ("euler", "midpoint", "adams3", "dopri5")  # measured first
@@ -44,6 +46,7 @@ TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5)  # of adaptive methods
 _REPEATS = 5  # maximum timed solutions per scan
 _PATIENCE = 0.5  # seconds after which timing stops
 _REFERENCE = 800  # evaluations of a reference solution, about
+_COARSE = {"steps": 32, "tolerance": 1e-5}  # a reference where there is no time for another
 _ROUNDING = 1e-9  # smallest error distinguishable from rounding in float64
 _COLUMNS = {
     "problem": "problem",
@@ -59,6 +62,50 @@ _COLUMNS = {
 }
 
 
+def report_solvers(
+    model: str | None = None,
+    samplers: Sequence[str] | None = None,
+    budgets: Sequence[int] = (4, 8, 16, 32, 64),
+    problems: Sequence[str] = tuple(PROBLEMS),
+    num: int = 4,
+    seed: int = 0,
+    batch_size: int = 1,
+    seconds: float = math.inf,
+    device: str = "cpu",
+) -> Page:
+    """The page of solvers on test problems with exact solutions and on `num` scans of a trained
+    flow.
+
+    With `seconds`, as few scans and other than the usual solvers as take about this time.
+
+    Args:
+        samplers: Solvers; default: all built-in, without which `seconds` bound nothing.
+        budgets: Evaluations of fixed-step solvers.
+    """
+    methods = configurations(samplers or METHODS, budgets)
+    subjects = problem_subjects(problems)
+    if not methods or not (problems or model):
+        raise InputError(
+            "nothing to measure: give a model or more --budgets, or no --problems none."
+        )
+    logging.getLogger("r2flow.flow").setLevel(logging.ERROR)  # the report counts failed scans
+    seconds = math.inf if samplers else seconds
+    until = time.monotonic() + seconds
+    flow = None
+    if model is not None:
+        checkpoint = load_checkpoint(model, device)
+        affordable = _affordable(checkpoint, num, seconds / 2)
+        how: Row = {"steps": 128, "tolerance": 1e-7} if affordable else _COARSE
+        num = max(affordable, 1)
+        with Bar("measuring", num * how["steps"] * 4, "reference evaluations") as advance:
+            how = {"progress": advance, **how}
+            flow = checkpoint_subject(checkpoint, model, num, seed, batch_size, **how)
+        subjects.insert(0, flow)
+    with Bar("measuring", len(subjects) * len(methods), "solutions") as advance:
+        rows = measure(subjects, methods, advance, until)
+    return solvers_page(rows, flow, budgets, {"scans": seed}, device)
+
+
 def configurations(
     methods: Sequence[str], budgets: Sequence[int], tolerances: Sequence[float] = TOLERANCES
 ) -> dict[str, Row]:
@@ -67,20 +114,20 @@ def configurations(
     All fixed-step methods at numbers of steps that fit the budgets, all adaptive methods at the
     tolerances.
     """
-    chosen: dict[str, Row] = {}
+    found: dict[str, Row] = {}
     for method in methods:
         how = method_of(method)
         if how.adapts:
             for tolerance in tolerances:
-                chosen[f"{method}, {tolerance:.0e}"] = {"method": method, "tolerance": tolerance}
+                found[f"{method}, {tolerance:.0e}"] = {"method": method, "tolerance": tolerance}
             continue
         start = getattr(how, "start", 0)
         per_step = getattr(how, "evaluations", 1)
         for steps in sorted({(budget - start) // per_step for budget in budgets}):
             if steps > 0:
                 label = f"{method}, {steps} step{'s' if steps > 1 else ''}"
-                chosen[label] = {"method": method, "steps": steps, "grid": usual_grid(method)}
-    return chosen
+                found[label] = {"method": method, "steps": steps, "grid": usual_grid(method)}
+    return found
 
 
 @dataclass(frozen=True)
@@ -139,7 +186,7 @@ def checkpoint_subject(
 @torch.inference_mode()
 def measure(
     subjects: Sequence[Subject],
-    chosen: Mapping[str, Row],
+    methods: Mapping[str, Row],
     progress: Progress = None,
     until: float = math.inf,
 ) -> list[Row]:
@@ -153,7 +200,7 @@ def measure(
     solutions: dict[tuple[str, str], list[Solution]] = {}
     for subject in subjects:
         subject.velocity(subject.x_0.new_zeros(()), subject.x_0[:1])  # warm up
-    for _, (label, options), subject in product(range(_REPEATS), chosen.items(), subjects):
+    for _, (label, options), subject in product(range(_REPEATS), methods.items(), subjects):
         taken = seconds.setdefault((subject.name, label), [])
         late = time.monotonic() > until and (taken or options["method"] not in USUAL)
         if late or sum(taken) >= _PATIENCE:
@@ -165,18 +212,22 @@ def measure(
             if progress is not None:
                 progress()
     rows = []
-    for subject, (label, options) in product(subjects, chosen.items()):
+    for subject, (label, options) in product(subjects, methods.items()):
         if found := solutions.get((subject.name, label)):
             row = {"problem": subject.name, "label": label, **_row(subject, options, found)}
             rows.append(row | {"seconds": float(np.median(seconds[subject.name, label]))})
     return rows
 
 
-def affordable(rows: Sequence[Row], chosen: Mapping[str, Row], seconds: float) -> int:
-    """Number of scans whose reference and configurations take about these seconds."""
-    one = sum(row["seconds"] for row in rows) / sum(row["evaluations"] for row in rows)
-    steps = [options.get("steps", 0) * 4 or 100 for options in chosen.values()]  # at most; about
-    return int(min(seconds, 1e6) / (one * (_REFERENCE + sum(steps))))
+def _affordable(checkpoint: Checkpoint, num: int, seconds: float) -> int:
+    """Number of scans, up to `num`, whose reference solutions take about these seconds."""
+    flow = as_flow(checkpoint.generator, "report solvers")
+    x = Draws(0, [0]).start(flow.noise_shape).to(flow.device)
+    evaluate = partial(flow.velocity, x.new_zeros(()), x)
+    with torch.inference_mode():
+        evaluate()  # warm up
+        _, one = timed(evaluate, flow.device)
+    return int(min(num, seconds / (one * _REFERENCE)))
 
 
 def _timed_solutions(subject: Subject, options: Row) -> Iterator[tuple[Solution, float]]:
@@ -251,19 +302,14 @@ def solvers_page(
     budgets: Sequence[int],
     seeds: Mapping[str, int],
     device: str = "cpu",
-    saved: Sequence[Row] = (),
 ) -> Page:
-    """Build the report on the rows of `measure`; `subject` is the trained flow, if any.
-
-    `saved` are rows of `r2flow.reports.savings`.
-    """
+    """Build the report on the rows of `measure`; `subject` is the trained flow, if any."""
     text: list[Part] = []
     figures = {}
     groups = {name: list(group) for name, group in groupby(rows, itemgetter("problem"))}
     if subject is not None:
         flow = groups.pop(subject.name)
-        text += flow_text(flow, subject)
-        text += savings_text(saved)
+        text += _flow_text(flow, subject)
         plots = [
             _plot(subject.name, flow, x, y)
             for x in ("evaluations", "seconds")
@@ -290,7 +336,7 @@ def solvers_page(
     return Page("solvers", title, text, rows, figures, seeds, device, details=every)
 
 
-def flow_text(rows: Sequence[Row], subject: Subject) -> list[Part]:
+def _flow_text(rows: Sequence[Row], subject: Subject) -> list[Part]:
     """Recommended solvers per error on a trained flow."""
     plugins = [f"--plugin={name}" for name in loaded_plugins()]
     command = shlex.join(["r2flow", "sample", subject.name, *plugins])

@@ -10,11 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.base.noise import Draws
 from r2flow.flow.problems import PROBLEMS
-from r2flow.flow.solvers import solve
-from r2flow.generators import build_generator
-from r2flow.reports.savings import savings, savings_text
 from r2flow.reports.solvers import (
     Subject,
     best_within,
@@ -26,7 +22,6 @@ from r2flow.reports.solvers import (
     solvers_page,
 )
 from r2flow.reports.tables import markdown
-from tests.conftest import CONFIG
 from tests.fields import Field
 from tests.test_sampling import GaussianFlow
 
@@ -114,20 +109,9 @@ def test_the_exact_problems_are_reported_with_what_was_not_solved():
 
 
 def test_what_comes_after_the_time_has_no_row():
-    chosen = configurations(["euler", "rk4"], [4], [])
-    rows = measure(problem_subjects(["straight"], 2, 4), chosen, until=-1.0)
+    methods = configurations(["euler", "rk4"], [4], [])
+    rows = measure(problem_subjects(["straight"], 2, 4), methods, until=-1.0)
     assert [row["method"] for row in rows] == ["euler"]
-
-
-def test_a_saving_is_what_a_flow_leaves_out():
-    flow = build_generator(CONFIG)
-    common, early, *_, channel = savings(flow, 2)
-    x_0 = Draws(0, range(2)).start(flow.noise_shape)
-    part = solve(flow.velocity, x_0, 0.0, 31 / 32, method="dopri5", tolerance=1e-3)
-    assert early["evaluations"] == part.evaluations.double().mean() + 1
-    assert common["evaluations"] == early["whole_evaluations"]
-    assert channel["seconds_share"] == 1
-    assert savings_text([]) == []
 
 
 def test_an_adaptive_sampler_says_what_each_scan_took(r2flow, saved, tmp_path):
@@ -159,7 +143,6 @@ def test_the_verb_writes_the_report(r2flow, saved, tmp_path, monkeypatch, caplog
         return checkpoint_subject(checkpoint, *given, **options | {"steps": 16, "tolerance": 1e-3})
 
     monkeypatch.setattr("r2flow.reports.solvers.checkpoint_subject", quick)
-    monkeypatch.setattr("r2flow.reports.savings.savings", lambda *_: [])
     monkeypatch.setattr("r2flow.base.plugins._loaded", {"of/mine.py": "of/mine.py"})
     out = tmp_path / "reports"
     options = [
