@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from r2flow.data.described import describe
 from r2flow.data.loader import FlowDataset, ItemFormat
-from r2flow.data.opening import describe, find_drives
-from r2flow.data.prepared import plan_files, prepare
+from r2flow.data.preparing import plan, prepare
 from r2flow.data.reading import Reading, read_image
 from r2flow.data.sources import spread
 from r2flow.lidar.encoding import Encoding
@@ -109,11 +109,7 @@ def measure_shards(paths: Sequence[Path], folder: Path, times: int) -> None:
     chosen.mkdir()
     for number, path in enumerate(paths):
         (chosen / f"{number:06d}.bin").symlink_to(path.resolve())
-    prepare(
-        plan_files(
-            folder / "prepared", "folder", chosen, find_drives("folder", chosen), Reading(HDL64E)
-        )
-    )
+    prepare(plan(folder / "prepared", describe(chosen), Reading(HDL64E)))
     scans = describe(folder / "prepared")
     prepared = scans.open(Reading(HDL64E, reflectance=True))
     arrays = [folder / f"{i}.npy" for i in range(len(paths))]
@@ -165,12 +161,8 @@ def main() -> None:
         root, layout = options.root or folder / "simulated", options.layout
         if options.root is None:
             simulated_files(root, options.scans)
-        found = [
-            Path(p)
-            for d in find_drives(layout, root, options.split)
-            for p in d.scans
-            if p.endswith(".bin")
-        ]
+        scans = describe(f"{layout}:{root}", split=options.split)
+        found = [Path(path) for path in scans.paths if path.endswith(".bin")]
         paths = [found[i] for i in spread(len(found), options.scans)]
         measure_projection(paths, options.times)
         measure_shards(paths, folder, options.times)

@@ -23,8 +23,9 @@ from r2flow import cli
 from r2flow.base import errors
 from r2flow.base.errors import InputError
 from r2flow.base.registry import construct
-from r2flow.data.opening import find_drives
-from r2flow.data.prepared import plan_files, prepare
+from r2flow.data.described import describe
+from r2flow.data.layouts import Drive
+from r2flow.data.preparing import plan, prepare
 from r2flow.data.reading import Reading
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
@@ -356,6 +357,10 @@ def generated(tmp_path: Path) -> Path:
     return folder(tmp_path / "generated", images(10, 2))
 
 
+def find_drives(name: str, root: Path, split=None, drives=None) -> list[Drive]:
+    return describe(f"{name}:{root}", split=split, drives=drives).drives
+
+
 def prepare_folder(root: Path, out: Path, sensor: Sensor, layout: str = "folder") -> Path:
-    prepare(plan_files(out, layout, root, find_drives(layout, root), Reading(sensor)))
+    prepare(plan(out, describe(f"{layout}:{root}"), Reading(sensor)))
     return out

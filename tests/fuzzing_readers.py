@@ -9,7 +9,7 @@ import numpy as np
 
 from r2flow.base.errors import InputError
 from r2flow.base.files import reading
-from r2flow.data.opening import SOURCES, Described, describe
+from r2flow.data.described import Described, describe
 from r2flow.data.options import PairOptions, SourceOptions
 from r2flow.data.pairs import PairStore
 from r2flow.data.prepared import PreparedScans
@@ -56,9 +56,8 @@ def in_folder(name: str) -> Callable[[Path], Path]:
 
 def prepared(path: Path) -> bytes:
     folder = in_folder("prepared")(path)
-    source = SOURCES["prepared"].open(
-        Described("it", SourceOptions("prepared", str(folder))), Reading(SENSOR, reflectance=True)
-    )
+    scans = Described("it", SourceOptions("prepared", str(folder)))
+    source = scans.kind.open(scans, Reading(SENSOR, reflectance=True))
     assert isinstance(source, PreparedScans)
     for shard in source.rows[:, 1]:
         try:

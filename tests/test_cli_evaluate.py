@@ -16,9 +16,8 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.data import opening
-from r2flow.data.layouts import Layout
-from r2flow.evaluation import comparing
+from r2flow.evaluation import measuring
+from r2flow.evaluation.comparing import Comparer
 from r2flow.generators import build_generator
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
@@ -74,27 +73,6 @@ def test_the_json_holds_everything_about_a_figure(r2flow, real, generated, tmp_p
     for words in ("JSD x 10^2", "MMD x 10^4", f"{100 * jsd['figures']['jsd']:#.4g}", "(10 : 12)"):
         assert words in said
     assert len(list((tmp_path / "cache" / "statistics").iterdir())) == 4
-
-
-def test_each_name_is_looked_up_once_and_each_folder_listed_once(
-    r2flow, real, generated, monkeypatch
-):
-    looked: list[str] = []
-    listed: list[str] = []
-    describe, find_drives = opening.describe, Layout.find_drives
-    monkeypatch.setattr(
-        opening,
-        "describe",
-        lambda spec: looked.extend([spec] if isinstance(spec, str) else []) or describe(spec),
-    )
-    monkeypatch.setattr(
-        Layout,
-        "find_drives",
-        lambda kind, options: listed.append(str(options.root)) or find_drives(kind, options),
-    )
-    r2flow("evaluate", real, generated, *QUICK, "--no-reference", "--no-baselines")
-    assert looked == [str(generated), str(real)]
-    assert sorted(listed) == sorted([str(real), str(generated)])
 
 
 def test_a_scale_of_reflectance_is_asked_for_where_it_matters(r2flow, real, tmp_path):
@@ -285,14 +263,14 @@ def test_an_adaptive_solver_is_one_set(points, saved):
 def test_an_evaluation_resumes(points, saved, monkeypatch):
     first, _ = points(saved[0], "--steps", "1,2", "--batch-size", 2)
     measured: list[int] = []
-    measure = comparing.measure
-    monkeypatch.setattr(comparing, "measure", lambda *a: (measured.append(1), measure(*a))[1])
+    measure = Comparer.measure
+    monkeypatch.setattr(Comparer, "measure", lambda *a: (measured.append(1), measure(*a))[1])
     second, _ = points(saved[0], "--steps", "4,2,1", "--batch-size", 2)
     assert len(measured) == 1
     assert second[1:] == first[::-1]
     assert [row["evaluations"] for row in second] == [4, 2, 1]
     # of another version, whose figures may differ
-    monkeypatch.setattr(comparing.measuring, "FORMAT", 0)
+    monkeypatch.setattr(measuring, "FORMAT", 0)
     points(saved[0], "--steps", "1", "--batch-size", 2)
     assert len(measured) == 2
 

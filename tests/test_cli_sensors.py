@@ -10,7 +10,8 @@ import yaml
 
 import r2flow as package
 from r2flow.base.errors import InputError
-from r2flow.data.opening import open_scans, reading_for
+from r2flow.data.detection import reading_for
+from r2flow.data.opening import open_scans
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor, read_sensor

@@ -13,8 +13,8 @@ import pytest
 
 from r2flow import load
 from r2flow.data.opening import open_scans
-from r2flow.data.partial import seeing_all
 from r2flow.data.reading import Reading
+from r2flow.data.seeing import seeing_all
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS

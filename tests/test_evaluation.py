@@ -13,20 +13,19 @@ import torch
 
 from r2flow.base.errors import InputError
 from r2flow.base.noise import standard_normal
-from r2flow.data.opening import open_scans, reading_for
+from r2flow.data.detection import reading_for
+from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading
 from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.evaluation import measuring
 from r2flow.evaluation.comparing import Comparison, with_equal_panels
 from r2flow.evaluation.measuring import (
     Cache,
+    Measurer,
     MetricResult,
     Statistics,
     Work,
-    _real_rule,
-    gather_real,
     key_of,
-    measure,
 )
 from r2flow.evaluation.sets import reference_sets, sampled_set
 from r2flow.lidar.projection import image_to_points
@@ -44,8 +43,8 @@ READING = Reading(SENSOR)
 def measured(
     real: ScanSet, generated: ScanSet, cache: Cache | None = None, work: Work | None = None
 ):
-    metrics, work = {"jsd": JSD(), "mmd": MMD()}, work or Work()
-    return measure(metrics, gather_real(metrics, real, work, cache), generated, work)
+    measurer = Measurer({"jsd": JSD(), "mmd": MMD()}, work or Work(), cache=cache)
+    return measurer.measure(measurer.gather(real), generated)
 
 
 def figures(*given, **how) -> dict[str, float]:
@@ -75,7 +74,7 @@ class TestCache:
         monkeypatch.setattr(
             ScanSet, "batches", lambda *_: pytest.fail("the real scans were read again")
         )
-        gather_real({"jsd": JSD(), "mmd": MMD()}, truth, Work(), cache)
+        Measurer({"jsd": JSD(), "mmd": MMD()}, cache=cache).gather(truth)
         monkeypatch.undo()
         assert figures(truth, other, cache) == fresh
 
@@ -141,18 +140,17 @@ class TestCache:
         assert cache.read("key") is None
 
     def test_sampled_scans_are_never_kept(self, tmp_path):
-        gather_real(
-            {"jsd": JSD()}, sampled_set(flow(), "flow", 2), Work(), Cache(tmp_path / "cache")
-        )
+        measurer = Measurer({"jsd": JSD()}, cache=Cache(tmp_path / "cache"))
+        measurer.gather(sampled_set(flow(), "flow", 2))
         assert not (tmp_path / "cache").exists()
 
 
 def test_some_metrics_are_of_the_field_s_subset_and_some_of_every_scan(real, monkeypatch):
     monkeypatch.setattr(measuring, "REAL_SCANS", 5)
     metrics = {"jsd": JSD(), "returns": CountReturns()}
-    gathered = gather_real(metrics, open_scans(str(real), READING), Work(batch_size=2))
+    gathered = Measurer(metrics, Work(batch_size=2)).gather(open_scans(str(real), READING))
     chosen = fixed_choice(12, 5)
-    assert [one.chosen for one in gathered.values()] == ["5 of 12, fixed shuffle, seed 0", "all 12"]
+    assert [one.choice for one in gathered.values()] == ["5 of 12, fixed shuffle, seed 0", "all 12"]
     assert [one.scans for one in gathered.values()] == [5, 12]
     r = images(12, 1)[:, 0]
     assert gathered["jsd"].states["sums"].sum() == ((r > 3) & (r < 63))[chosen].sum()
@@ -185,10 +183,8 @@ def test_the_fixed_shuffle_is_stated_and_does_not_change():
         81106
     )
     assert fixed_choice(81106, 10000)[:3] == sorted(shuffled[:10000])[:3]
-    assert _real_rule(JSD(), open_scans("simulated:0", READING, num=10_000)) == (
-        range(10_000),
-        "all 10000",
-    )
+    scans = open_scans("simulated:0", READING, num=10_000)
+    assert Measurer({})._chosen_scans(JSD(), scans) == (range(10_000), "all 10000")
 
 
 class TestSets:

@@ -13,7 +13,7 @@ import torch
 from r2flow.base.errors import InputError
 from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading
-from r2flow.evaluation.measuring import Work, _real_rule, gather_real, measure
+from r2flow.evaluation.measuring import Measurer
 from r2flow.evaluation.protocols import PAPER, R2FLOW, _published_choice
 from r2flow.lidar.scan_files import write_points
 from r2flow.metrics import METRICS
@@ -92,8 +92,9 @@ def measured(tmp_path: Path) -> tuple[Path, list[np.ndarray]]:
 
 def figure(real: Path, judged: Path, rules, metric: str = "jsd") -> float:
     metrics = {metric: METRICS[metric]()}
-    gathered = gather_real(metrics, open_scans(str(real), READING), Work(), protocol=rules)
-    (one,) = measure(metrics, gathered, open_scans(str(judged), READING), Work(), protocol=rules)
+    measurer = Measurer(metrics, rules=rules)
+    gathered = measurer.gather(open_scans(str(real), READING))
+    (one,) = measurer.measure(gathered, open_scans(str(judged), READING))
     assert one.protocol["name"] == rules.name
     return one.figures[metric]
 
@@ -129,11 +130,10 @@ def test_the_paper_s_subset_is_its_own_draw_of_all_scans_with_test_drives_last(
     theirs = [*range(6, 15), *range(6)]  # drives 3, 4, 10, then 0, 2
     expected = sorted(theirs[p] for p in place[:5])
     assert _published_choice(scans, 5) == expected
-    assert _real_rule(METRICS["jsd"](), scans, PAPER) == (
-        expected,
-        "5 of 15, Python's shuffle, seed 0",
-    )
-    assert _real_rule(METRICS["jsd"](), scans)[0] != expected
+    jsd = METRICS["jsd"]()
+    of_paper = Measurer({}, rules=PAPER)._chosen_scans(jsd, scans)
+    assert of_paper == (expected, "5 of 15, Python's shuffle, seed 0")
+    assert Measurer({})._chosen_scans(jsd, scans)[0] != expected
     assert _published_choice(open_scans("simulated:0", READING, num=15), 5) == sorted(place[:5])
 
 

@@ -72,7 +72,8 @@ def ablate(
     """
     from r2flow.base.files import write_file
     from r2flow.base.signals import LATER
-    from r2flow.data.opening import open_scans, reading_for
+    from r2flow.data.detection import reading_for
+    from r2flow.data.opening import open_scans
     from r2flow.data.sets import ScanSet
     from r2flow.model.checkpoint import Checkpoint
     from r2flow.reports.ablation import Judge, measure_run, read_rows, reference_rows, write_rows

@@ -1,8 +1,6 @@
 """`r2flow simulate`, `prepare`, `sensor` and `unpack`: sources of scans."""
 
 import re
-import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -84,19 +82,14 @@ def prepare(
     The same command resumes an interrupted run, shares the work with others at the same time and
     replaces damaged shards. Train on them with python train.py data=prepared data.root=FOLDER.
     """
-    from r2flow.data import prepared
-    from r2flow.data.opening import describe
+    from r2flow.data import preparing
+    from r2flow.data.described import describe
 
-    described = describe(scans)
+    described = describe(scans, split=split, drives=[*drives.split(",")] if drives else None)
     if described.file is not None:
         raise InputError(f"{scans} is one scan; give the folder of a data set.")
-    options = replace(
-        described.options, split=split, drives=[*drives.split(",")] if drives else None
-    )
-    found = described.kind.find_drives(options)
-    how = reading.reading([scans])
-    store = prepared.plan_files(out, options.name, options.folder, found, how, shard_scans)
-    left_out, made = prepared.prepare(store, on_bad_scan, workers or cores())
+    store = preparing.plan(out, described, reading.reading([described]), shard_scans)
+    left_out, made = preparing.prepare(store, on_bad_scan, workers or cores())
     size = sum(store.files(shard)[0].stat().st_size for shard in store.shards)
     there = len(store.shards) - len(made)
     levels = store.described["levels"]
@@ -137,14 +130,14 @@ def sensor(
 
     from r2flow.base.errors import warn_odd
     from r2flow.base.progress import track
-    from r2flow.data.reading import DARK, is_dark
-    from r2flow.data.sources import warn_of_frame
+    from r2flow.data.described import describe
+    from r2flow.data.reflectance import DARK, is_dark
+    from r2flow.data.sensor_checks import warn_of_frame
     from r2flow.lidar.estimation import estimate_sensor, hangs
     from r2flow.lidar.matching import nearest_sensor
     from r2flow.lidar.scan_files import points_beside, read_points
     from r2flow.lidar.sensors import ENDINGS, SENSORS, sensor_yaml, write_sensor
     from r2flow.reports.tables import print_table
-    from r2flow.reports.view.panels import list_scans
 
     name = "mine"
     if out is not None:
@@ -153,9 +146,10 @@ def sensor(
         name = re.sub(r"\W", "_", out.stem, flags=re.ASCII)
         if name in SENSORS or not name[0].isalpha():
             name = f"my_{name}"
-    paths = [points_beside(path) for scan in scans for path in list_scans(scan, most)[0]]
+    files = [path for scan in scans for path in describe(scan).some(most)]
+    paths = [points_beside(Path(path)) for path in files]
     points = [read_points(path, columns) for path in track(paths, "reading", "scans", least=16)]
-    warn_of_frame(dict(zip(paths, points, strict=True)), alike=True)
+    warn_of_frame(dict(zip(paths, points, strict=True)))
     mine, beams, steps, off, ground = estimate_sensor(points, name)
     degrees = mine.elevations
     nearest, distance = nearest_sensor(beams.elevations)
@@ -238,9 +232,9 @@ def pack(
     columns: ColumnsOption = None,
 ) -> None:
     """Write scan files as the PointCloud2 messages of a recording, with all their fields."""
+    from r2flow.data.described import describe
     from r2flow.lidar.packing import pack as write
-    from r2flow.reports.view.panels import list_scans
 
-    paths = [path for one in scans for path in list_scans(one, sys.maxsize)[0]]
+    paths = [Path(path) for one in scans for path in describe(one).paths]
     write(paths, out, topic, frame, rate, columns)
     print(f"{several(len(paths))} in {out}")

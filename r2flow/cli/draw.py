@@ -30,6 +30,7 @@ from r2flow.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from r2flow.data.described import Described
     from r2flow.data.partial import PartialScan
     from r2flow.generators.base import Precision
     from r2flow.lidar.region import Region
@@ -268,7 +269,7 @@ class PartialOptions:
         return loaded
 
     def open(
-        self, model: str, device: str, what: Sequence[str]
+        self, model: str, device: str, what: "Sequence[Described]"
     ) -> "tuple[Checkpoint, list[PartialScan], list[str]]":
         """The model, for another sensor if given, the scans as it takes them, and remarks on their
         sensor.
@@ -338,6 +339,7 @@ def complete(
     Files have the format of the input, or .ply if it cannot be written. The same command resumes an
     interrupted run. A recording becomes another, as --out dense.mcap.
     """
+    from r2flow.data.described import describe
     from r2flow.lidar.bags import is_recording
     from r2flow.lidar.known import mask_identity, parse_mask
     from r2flow.lidar.labels import SEMANTIC_KITTI, label_list
@@ -360,12 +362,13 @@ def complete(
     job = Job(num, seed, mask, given.fill_gaps, hidden, batch_size, pictures, label_ids=ids)
     jumps = how.given.get("name", "jump") in ("jump", "transport")
     name = checkpoint or (DENSIFY if jumps else DEFAULT)
-    loaded, scans, remarks = given.open(name, device, what)
+    described = [describe(one) for one in what]
+    loaded, scans, remarks = given.open(name, device, described)
     if checkpoint is None:
         for_densify = given.to or given.size or how.sampler
         if name == DENSIFY and not for_densify and lack_sectors(scans, job):
             name = DEFAULT
-            loaded, scans, remarks = given.open(name, device, what)
+            loaded, scans, remarks = given.open(name, device, described)
         _print_model(name)
     for channel in given.hide or ():
         check(

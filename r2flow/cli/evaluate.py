@@ -76,10 +76,10 @@ def _evaluate(
     real: str, named: Sequence[str], options: EvaluateOptions, how: ReadingOptions, device: str
 ) -> None:
     from r2flow.base.processes import rank_and_world_size
-    from r2flow.data.opening import describe
+    from r2flow.data.described import describe
     from r2flow.evaluation.comparing import Comparer, pairs_of, with_equal_panels
     from r2flow.evaluation.copies import find_nearest, with_copies
-    from r2flow.evaluation.measuring import Cache, Work, check_reflectance
+    from r2flow.evaluation.measuring import Cache, Work
     from r2flow.evaluation.protocols import PROTOCOLS
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.metrics import METRICS
@@ -91,27 +91,27 @@ def _evaluate(
         chosen = {name: METRICS[name]().to(device) for name in options.metrics.split(",")}
     flows = {name: load_checkpoint(name, device) for name in named if is_checkpoint(name)}
     files = {name: describe(name) for name in named if name not in flows}
-    truths = describe(real)
-    trained = describe(options.train) if options.train else None
+    truths = describe(real, split=options.split)
+    trained = describe(options.train, split=options.train_split) if options.train else None
     how = replace(how, convention=how.convention or rules.convention)
     specs = [truths, *files.values(), *([trained] if trained else [])]
     reading = reading_of(how, specs, list(flows.values()))
     if chosen and not any(m.needs_reflectance or m.uses_reflectance for m in chosen.values()):
         reading = replace(reading, reflectance=False)  # else a scale would be required
-    truth = open_set(truths, reading, options.split, options.real_num)
+    truth = open_set(truths, reading, options.real_num)
     rules.check(truth)
     judged = judged_sets(named, flows, files, reading, options)
     sets = [truth, *judged.values()]
     reflectance = all(scans.about.get("reflectance") for scans in sets)
     metrics = chosen or possible_metrics(reflectance, options, device)
-    check_reflectance(metrics, sets)
-    training = trained and open_set(trained, reading, options.train_split, None)
+    work = Work(options.batch_size, options.workers)
+    cache = None if options.no_cache else Cache()
+    results = options.out and options.out / "results"
+    compare = Comparer(metrics, work, rules, cache, results)
+    compare.check(sets)
+    training = trained and open_set(trained, reading, None)
     for folder in filter(None, (options.out, options.json and options.json.parent)):
         check_folder(folder)
-    work = Work(options.batch_size, options.workers)
-    results = options.out and options.out / "results"
-    cache = None if options.no_cache else Cache()
-    compare = Comparer(metrics, work, rules, cache, results, device)
     pairs = pairs_of(truth, judged, options.reference, options.baselines)
     comparisons = with_equal_panels([compare(*pair) for pair in pairs])
     if rank_and_world_size()[0] > 0:  # the first process prints and writes the results

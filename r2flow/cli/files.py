@@ -124,7 +124,7 @@ def _export_completion(
     model: "Checkpoint", out: Path, source: str, sensor: str | None, size: Any
 ) -> None:
     """Export a transfer flow for scans of a sensor, completed in the view of `complete`."""
-    from r2flow.data.partial import seeing_all
+    from r2flow.data.seeing import seeing_all
     from r2flow.lidar.sensors import named_sensor
     from r2flow.model.completion_export import compare_completion, export_completion
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from typer import Argument, Option
 
 if TYPE_CHECKING:
-    from r2flow.data.opening import Spec
+    from r2flow.data.described import Spec
     from r2flow.data.reading import Reading
     from r2flow.model.checkpoint import Checkpoint
 
@@ -168,7 +168,7 @@ class ReadingOptions:
 
     def reading(
         self,
-        specs: "Sequence[Spec | None]",
+        specs: "Sequence[Spec]",
         model: "Checkpoint | None" = None,
         estimate: bool = False,
     ) -> "Reading":
@@ -176,7 +176,7 @@ class ReadingOptions:
 
         `estimate`: what the sensor's name does not tell, as for pictures.
         """
-        from r2flow.data.opening import reading_for
+        from r2flow.data.detection import reading_for
 
         how = asdict(self)
         return reading_for(specs, model, estimate_scale=estimate, estimate_beams=estimate, **how)

@@ -24,7 +24,7 @@ from r2flow.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from r2flow.data.opening import Described
+    from r2flow.data.described import Described
     from r2flow.data.reading import Reading
     from r2flow.data.sets import ScanSet
     from r2flow.metrics.base import ScanMetric
@@ -108,7 +108,8 @@ def reading_of(
     """How points become images, whatever the order of models and samples: with all returns that any
     of them has.
     """
-    from r2flow.data.opening import PREPARED, reading_for
+    from r2flow.data.detection import reading_for
+    from r2flow.data.options import PREPARED
     from r2flow.metrics.scans import MASK
 
     sensors = {(flow.sensor.shape, flow.sensor.elevations) for flow in flows}
@@ -129,12 +130,10 @@ def reading_of(
     return replace(reading, sensor=sensor, convention=reading.convention if agreed else "centre")
 
 
-def open_set(
-    described: "Described", reading: "Reading", split: str | None, num: int | None
-) -> "ScanSet":
+def open_set(described: "Described", reading: "Reading", num: int | None) -> "ScanSet":
     from r2flow.data.opening import open_scans
 
-    scans = open_scans(described, reading, split, num)
+    scans = open_scans(described, reading, num=num)
     described.refuse_parts()
     _ = scans.source[0]  # fail before the other set is read
     return scans
@@ -155,7 +154,7 @@ def judged_sets(
         if text in flows:
             sets |= _sampled(name, flows[text], options)
         else:
-            sets[name] = open_set(files[text], reading, None, options.num)
+            sets[name] = open_set(files[text], reading, options.num)
     return sets
 
 

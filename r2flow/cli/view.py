@@ -55,18 +55,17 @@ def show(
     range images.
     """
     from r2flow.base.files import check_folder, save_array
-    from r2flow.data.opening import describe
+    from r2flow.data.described import describe
     from r2flow.reports.figures import save_figure
     from r2flow.reports.pictures import STREET, scan_figure, view_of
     from r2flow.reports.view.panels import scan_panels, share_scale
 
-    if format == "npy" and out.resolve() in {
-        describe(spec).options.folder.resolve() for spec in scans
-    }:
+    described = [describe(spec) for spec in scans]
+    if format == "npy" and out.resolve() in {one.options.folder.resolve() for one in described}:
         raise InputError(f"{out} is the folder of the scans; give another --out.")
     check_folder(out)
     names: set[str] = set()
-    readings = {spec: how.reading([spec], estimate=True) for spec in scans}
+    readings = {one: how.reading([one], estimate=True) for one in described}
     panels = [panel for _, panel in scan_panels(share_scale(readings, most), most)]
     view = STREET if fixed else view_of(*((panel.images[0][:2], panel.rays) for panel in panels))
     for panel in panels:
@@ -126,7 +125,7 @@ def view(
     The cursor links points and range image; labels next to the scans are shown.
     """
     from r2flow.base.files import write_file
-    from r2flow.data.opening import describe
+    from r2flow.data.described import describe
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports.view import page
@@ -135,11 +134,11 @@ def view(
     where = choose_device(device)
     models = {spec: load_checkpoint(spec, where) for spec in what if is_checkpoint(spec)}
     first = None if how.sensor or how.size else next(iter(models.values()), None)
-    readings = {}
-    for spec in what:
-        if spec not in models:
-            model = None if describe(spec).stored else first
-            readings[spec] = how.reading([spec], model, estimate=True)
+    described = {spec: describe(spec) for spec in what if spec not in models}
+    readings = {
+        scans: how.reading([scans], None if scans.stored else first, estimate=True)
+        for scans in described.values()
+    }
     readings = share_scale(readings, num or _SCANS)
     drawn = [] if sequence else list(scan_panels(readings, num or _SCANS))
     panels = []
@@ -147,10 +146,11 @@ def view(
         if spec in models:
             panels += sample_panels(models[spec], spec, num or _SAMPLES, seed, steps or ())
         elif sequence:
-            frames = scan_panels({spec: readings[spec]}, num or _SCANS)
+            scans = described[spec]
+            frames = scan_panels({scans: readings[scans]}, num or _SCANS)
             panels.append(as_frames([panel for _, panel in frames], spec))
         else:
-            panels += [panel for of, panel in drawn if of == spec]
+            panels += [panel for of, panel in drawn if of is described[spec]]
     content = page(panels, ", ".join(Path(spec).name or spec for spec in what))
     path = out or Path(mkdtemp(prefix="r2flow-"), "view.html")
     write_file(path, content)

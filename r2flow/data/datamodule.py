@@ -19,31 +19,31 @@ from r2flow.base.errors import InputError
 from r2flow.base.registry import Count, Natural, NonNegative, Options, Seed, construct
 from r2flow.base.signals import init_loader_worker
 from r2flow.data.augment import Augmentation
+from r2flow.data.kinds import SOURCES
 from r2flow.data.loader import (
     FlowDataset,
     Item,
     ItemFormat,
-    MixedOrder,
     Mixture,
     Order,
     Permutations,
     RunSampler,
 )
-from r2flow.data.opening import SOURCES, Described
 from r2flow.data.options import (
     MIXED,
     PAIRS,
     SIMULATED,
     DataOptions,
     PairOptions,
-    PartOptions,
     ReadingOptions,
     ValidationOptions,
 )
+from r2flow.data.own import DATASET
 from r2flow.data.pairs import PairDataset, PairStore
-from r2flow.data.reading import AUTO, Reading
+from r2flow.data.reading import AUTO
 from r2flow.data.resolving import lacking_reflectance, plan_data, reflectance_levels
-from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
+from r2flow.data.run_scans import in_memory, open_for_training, open_plan, order_of
+from r2flow.data.sources import holdout_block, spread
 from r2flow.lidar.encoding import Encoding, encoding_options
 from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
 
@@ -64,7 +64,8 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
         data = ScanDataModule("kitti_raw", root="KITTI", sensor="hdl64e_small", batch_size=8)
 
     Args:
-        name: Kind of scans, a name in `r2flow.data.opening.SOURCES`, `mixed` or `pairs`.
+        name: Kind of scans, a name in `r2flow.data.kinds.SOURCES`, `mixed` or `pairs`; or a
+            map-style `Dataset` of scans (`r2flow.data.own.DatasetScans`).
         sensor: Sensor of the images, its name, YAML file or options.
         encoding: Encoding of the images, a name in conf/encoding, or options; `reflectance: auto`
             looks at the scans.
@@ -90,7 +91,7 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
 
     def __init__(
         self,
-        name: str = SIMULATED,
+        name: str | Dataset[Any] = SIMULATED,
         sensor: Sensor | str | Mapping[str, Any] = "hdl64e",
         encoding: Encoding | str | Mapping[str, Any] = "logscale",
         seed: Seed = 0,
@@ -111,26 +112,28 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
     ) -> None:
         arguments = dict(locals())
         super().__init__()
-        options = {one.name: arguments[one.name] for one in fields(DataOptions)}
-        given = {key: value for key, value in options.items() if value is not None}
-        if name not in (MIXED, PAIRS) and name not in SOURCES and Path(name).expanduser().is_dir():
+        dataset = None
+        if not isinstance(name, str):
+            dataset = name
+            arguments["name"] = DATASET
+        elif name not in (MIXED, PAIRS, *SOURCES) and Path(name).expanduser().is_dir():
             raise InputError(f"{name} is a folder: give 'folder', or its kind, and root={name!r}.")
-        self.options = construct("data", DataOptions, given)
+        options = {one.name: arguments[one.name] for one in fields(DataOptions)}
+        options = {key: value for key, value in options.items() if value is not None}
+        self.options = construct("data", DataOptions, options)
         self.seed = seed
         self.batch_size = self.options.batch_size
         self._sensor_options = sensor_options(sensor)
         self._encoding_options = encoding_options(encoding)
         self.sensor = build_sensor(**self._sensor_options)
-        self.plan = plan_data(self.options, self.sensor)
+        self.plan = plan_data(self.options, self.sensor, seed)
+        for scans_of_plan in self.plan.sets:
+            scans_of_plan.dataset = dataset
         self.augment = construct("data.augment", Augmentation, self.options.augment)
-        self.pairs: PairOptions | None = None
-        if name == PAIRS:
-            self.pairs = self.options.pairs
-            if self.augment:
-                raise InputError(
-                    "data.augment changes scans, and an augmented pair is not a flow's; leave it "
-                    "out."
-                )
+        if self.pairs and self.augment:
+            raise InputError(
+                "data.augment changes scans, and an augmented pair is not a flow's; leave it out."
+            )
         # of fewer scans to predict than devices
         self.allow_zero_length_dataloader_with_multiple_devices = True
         self.item_format: ItemFormat | None = None
@@ -173,13 +176,9 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
         return construct("encoding", Encoding, options, self.sensor)
 
     @property
-    def sensors(self) -> list[Sensor]:
-        """The sensor of each set of scans."""
-        return [build_sensor(**part.sensor) if part.sensor else self.sensor for part in self._parts]
-
-    @property
-    def _parts(self) -> list[PartOptions]:
-        return [part.options for part in self.plan.sets if isinstance(part.options, PartOptions)]
+    def pairs(self) -> PairOptions | None:
+        """The pairs to learn from; None: scans."""
+        return self.options.pairs if self.options.name == PAIRS else None
 
     @property
     def format(self) -> ItemFormat:
@@ -194,11 +193,9 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
         """
         assert self.pairs is not None
         first = parent["first_pair"] if self.pairs.first is None else self.pairs.first
-        self.pairs = replace(self.pairs, parent=parent["weights"], first=first)
-        self.options = replace(
-            self.options, root=self.options.root or parent["pairs"], pairs=self.pairs
-        )
-        # the module logs those that they share
+        pairs = replace(self.pairs, parent=parent["weights"], first=first)
+        root = self.options.root or parent["pairs"]
+        self.options = replace(self.options, root=root, pairs=pairs)
         self.save_hyperparameters(self.described(), logger=False)
 
     @property
@@ -215,12 +212,16 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
         wanted = getattr(module, "item_format", None)
         if isinstance(wanted, ItemFormat):
             self.adopt(wanted)
-        if self.pairs is None and self.training_source is None:
-            self.training_source, self.validation_source = self.opened = self._open_all()
-            # refuses wrong weights before anything is read or written
-            self._order(self.training_source)
-        elif self.plan.scans is not None and self.scans is None:
-            self.scans = Mixture([self._open(self.plan.scans)])
+        encoding = self.format.encoding
+        if self.opened:
+            return
+        if self.pairs is None:
+            training, held_out, self.names = open_plan(self.plan, encoding, self.options.validation)
+            self.opened = training, held_out
+            self.training_source, self.validation_source = self.opened
+            self._order(training)  # refuses wrong weights before anything is read or written
+        elif self.plan.scans is not None:
+            self.scans = Mixture([open_for_training(self.plan.scans, encoding)])
             self.names = list(self.scans.names)
             self.opened = [self.scans]
 
@@ -232,14 +233,14 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
                 f"the module's images are of {sensor}, the data's of {self.sensor}: give both the "
                 "same sensor."
             )
-        several = any(part.sensor for part in self._parts)
+        several = any(sensor != self.sensor for sensor in self.plan.sensors)
         if several and not wanted.several_sensors:
             raise InputError(
                 "this stage learns from scans of one sensor: leave sensor out of data.parts."
             )
         rows, columns = wanted.smallest
-        for number, one in enumerate(self.sensors if several else ()):
-            if one.shape[0] < rows or one.shape[1] < columns:
+        for number, one in enumerate(self.plan.sensors):
+            if several and (one.shape[0] < rows or one.shape[1] < columns):
                 raise InputError(
                     f"data.parts[{number}]: crops of {rows}x{columns} need images as large, found "
                     f"{one.shape}."
@@ -249,72 +250,17 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
     def read(self) -> None:
         """Read the scans into memory if they fit; a second call reads at most one of each set."""
         self.setup()
+        most = self.options.memory_gib
         if self.scans is not None:
-            self.scans = self._kept(self.scans, "scans next to the pairs")
-        if isinstance(self.training_source, Mixture) and isinstance(
-            self.validation_source, Mixture
-        ):
-            self.training_source = self._kept(self.training_source, "training scans")
-            self.validation_source = self._kept(self.validation_source, "validation scans")
-
-    def _open_all(self) -> tuple[Mixture, Mixture]:
-        """The training and the validation scans, not yet read.
-
-        Without `validation.data`, each part of a mixture holds out one block.
-        """
-        whole: list[ScanSource] = []
-        first_scene = 0  # parts and held-out scans have different simulated scenes
-        for scans, sensor in zip(self.plan.sets, self.sensors, strict=True):
-            whole.append(self._open(scans, first_scene, sensor))
-            first_scene += scans.options.scenes if scans.options.name == SIMULATED else 0
-        for number, source in enumerate(whole):
-            # a number makes the names of several parts' scans distinct
-            label = f"{number}: " if len(whole) > 1 else ""
-            self.names += [f"{label}{name}" for name in source.names]
-        if self.plan.held_out is not None:
-            training = whole
-            held = [self._open(self.plan.held_out, first_scene)]
-        else:
-            training = []
-            held = []
-            for source in whole:
-                starts = sorted(numbers[0] for numbers in source.drives.values() if len(numbers))
-                first, last = holdout_block(len(source), self.options.validation.share, starts)
-                training.append(source.subset(first))
-                held.append(source.subset(last))
-        self._warn_of_shared(training, held)
-        validation = Mixture(held)
-        return Mixture(training), validation.subset(
-            spread(len(validation), self.options.validation.scans)
-        )
-
-    def _warn_of_shared(self, training: Sequence[ScanSource], held: Sequence[ScanSource]) -> None:
-        trained = set[str]().union(*(source.places() for source in training))
-        validated = set[str]().union(*(source.places() for source in held))
-        if shared := trained & validated:
-            log.warning(
-                "%d held-out scans are trained on, as %s: give each set its own split or drives",
-                len(shared),
-                min(shared),
-            )
-
-    def _open(
-        self, scans: Described, first_scene: int = 0, sensor: Sensor | None = None
-    ) -> ScanSource:
-        encoding = self.format.encoding
-        images = {
-            "reflectance": encoding.reflectance,
-            "labels": encoding.labels,
-            "within_limits": True,
-        }
-        own = (sensor or self.format.encoding.sensor).described()
-        reading = Reading.of({**scans.options.chosen, **images, "sensor": own})
-        return scans.open(reading, self.seed, first_scene)
+            self.scans = in_memory(self.scans, "scans next to the pairs", most)
+        if isinstance(self.training_source, Mixture):
+            self.training_source = in_memory(self.training_source, "training scans", most)
+        if isinstance(self.validation_source, Mixture):
+            self.validation_source = in_memory(self.validation_source, "validation scans", most)
 
     def _order(self, source: Scans) -> Order:
-        weights = [part.weight for part in self._parts if part.weight is not None]
-        if isinstance(source, Mixture) and len(weights) > 1:
-            return MixedOrder([len(part) for part in source.parts], weights, self.seed)
+        if isinstance(source, Mixture):
+            return order_of(source, self.plan.weights, self.seed)
         return Permutations(len(source), self.seed)
 
     def fingerprint(self) -> str:
@@ -341,17 +287,6 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
         ]
         held = len(self.names) - len(self.training_source)
         return f"{' and '.join(counts)}, {held} held out"
-
-    def _kept(self, source: Mixture, what: str) -> Mixture:
-        """The source with its slow parts read into memory, if they fit into `memory_gib`."""
-        parts = [*source.parts]
-        firsts = {i: part[0] for i, part in enumerate(parts) if part.slow and len(part)}
-        size = sum(len(parts[i]) * first.nbytes for i, first in firsts.items())
-        if size > self.options.memory_gib * 2**30:
-            return source
-        for i, first in firsts.items():
-            parts[i] = InMemory(parts[i].read_all(what, first.shape), parts[i].names)
-        return Mixture(parts)
 
     @property
     def ranks(self) -> tuple[int, int]:
@@ -422,7 +357,8 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
                 scans = FlowDataset(self.scans, item_format, self.seed, "beside")
             return PairDataset(self.pair_store, source, self.seed, purpose, scans)
         augment = self.augment if purpose == "training" else None
-        sensors = self.sensors if purpose == "training" or self.plan.held_out is None else []
+        whole_sets = purpose == "training" or self.plan.held_out is None
+        sensors = self.plan.sensors if whole_sets else []
         return FlowDataset(source, item_format, self.seed, purpose, augment, sensors)
 
     def val_dataloader(self) -> DataLoader[Item] | list[Any]:

@@ -9,21 +9,30 @@ from pydantic import Field
 
 from r2flow.base.config import Found, Free, Rule
 from r2flow.base.errors import InputError
-from r2flow.base.registry import Count, Natural, NonNegative, Portion, Positive, Seed, strict
+from r2flow.base.registry import (
+    Config,
+    Count,
+    Natural,
+    NonNegative,
+    Options,
+    Portion,
+    Positive,
+    Seed,
+    strict,
+)
 from r2flow.generators.base import Precision
 from r2flow.lidar.labels import SEMANTIC_KITTI, label_list
 from r2flow.lidar.projection import Convention, Projection
 from r2flow.lidar.scan_files import check_columns
 from r2flow.samplers import build_sampler
 
-# names in `r2flow.data.opening.SOURCES`
+# names in `r2flow.data.kinds.SOURCES`
 SIMULATED = "simulated"
 PREPARED = "prepared"
 FOLDER = "folder"
 # other values of `data.name`: several sets of scans, and pairs drawn by a flow
 MIXED = "mixed"
 PAIRS = "pairs"
-Data = dict[str, Any]  # of a config
 _OfAll = Rule(links="all")  # links of a chain
 
 
@@ -45,18 +54,13 @@ class ReadingOptions:
         check_columns(self.columns)
         label_list(self.label_ids or SEMANTIC_KITTI)
 
-    @property
-    def chosen(self) -> Data:
-        """The fields that are not None."""
-        return {key: value for key, value in asdict(self).items() if value is not None}
-
 
 @strict
 @dataclass(frozen=True)
 class SourceOptions:
     """One set of scans."""
 
-    name: str = SIMULATED  # kind of scans: a name in `r2flow.data.opening.SOURCES`
+    name: str = SIMULATED  # kind of scans: a name in `r2flow.data.kinds.SOURCES`
     root: Free[str | int | None] = None  # folder of the data set
     split: str | None = None  # part of the data set's standard split; None takes all
     drives: list[str | int] | None = None  # names or numbers of the drives to take; None takes all
@@ -64,9 +68,10 @@ class SourceOptions:
     reading: ReadingOptions | None = None
 
     @property
-    def chosen(self) -> Data:
+    def reading_fields(self) -> Config:
         """The fields of `reading` that are not None."""
-        return self.reading.chosen if self.reading else {}
+        fields = asdict(self.reading) if self.reading else {}
+        return {key: value for key, value in fields.items() if value is not None}
 
     @property
     def folder(self) -> Path:
@@ -83,7 +88,7 @@ class PartOptions(SourceOptions):
 
     weight: Positive | None = None  # relative share of a run's images
     # `build_sensor`; None: the run's. Only stage=transfer takes several
-    sensor: Mapping[str, Any] | None = None
+    sensor: Options | None = None
 
 
 @strict
@@ -94,7 +99,7 @@ class ValidationOptions:
     share: Portion = 0.1  # approximate share of the scans to hold out, in one contiguous block
     scans: Natural = 64  # maximum number of validation scans
     # another set of scans to hold out instead: {name, root, split, drives, ...}
-    data: Annotated[Mapping[str, Any] | None, SourceOptions, Rule(links="scans")] = None
+    data: Annotated[Options | None, SourceOptions, Rule(links="scans")] = None
 
 
 @strict
@@ -104,7 +109,7 @@ class PairOptions:
 
     num: Count = 1000
     # of the flow that draws them
-    sampler: Mapping[str, Any] = field(default_factory=lambda: {"name": "adams3"})
+    sampler: Options = field(default_factory=lambda: {"name": "adams3"})
     batch_size: Count = 16  # pairs solved in one batch; the last bits of a pair depend on it
     shard_mib: Positive = 16.0  # size of a shard; a killed process repeats its shard
     # seed of the noise, separate from the run's: runs of several seeds can share one set of pairs
@@ -130,9 +135,9 @@ class DataOptions(SourceOptions):
     """
 
     # of `mixed`: {name, root, split, drives, ..., weight} each
-    parts: Sequence[Annotated[Mapping[str, Any], PartOptions]] | None = None
+    parts: Sequence[Annotated[Options, PartOptions]] | None = None
     # `r2flow.data.augment.Augmentation`, of training scans only
-    augment: Mapping[str, Any] | None = None
+    augment: Options | None = None
     # images in one optimiser step, over all devices and accumulated batches
     batch_size: Annotated[Count, _OfAll] = 4
     # loader processes per device
@@ -142,7 +147,7 @@ class DataOptions(SourceOptions):
     validation: Annotated[ValidationOptions, _OfAll] = ValidationOptions()
     pairs: Annotated[PairOptions, Rule(links="pairs")] = PairOptions()
     # `SourceOptions` of scans next to pairs, for the velocities of a flow map
-    scans: Annotated[Mapping[str, Any] | None, SourceOptions, Rule(links="pairs")] = None
+    scans: Annotated[Options | None, SourceOptions, Rule(links="pairs")] = None
 
     def __post_init__(self) -> None:
         for key, name in (("parts", MIXED), ("scans", PAIRS)):

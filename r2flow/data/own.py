@@ -9,13 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from r2flow.data.layouts import SourceKind
+from r2flow.base.errors import InputError
+from r2flow.data.kinds import SOURCES, SourceKind
+from r2flow.data.options import ReadingOptions
 from r2flow.data.reading import Reading
 from r2flow.data.sources import ScanSource, spread
 
 if TYPE_CHECKING:
-    from r2flow.data.opening import Described
+    from r2flow.data.described import Described
 
+DATASET = "dataset"  # name of a data set that is given as it is
 _LOOKED_AT = 8  # scans whose values identify the data set
 
 
@@ -59,17 +62,24 @@ class DatasetKind(SourceKind):
     """
 
     make: Callable[[Path | None], Any]
-    sensor: str = "hdl64e"
-    levels: int | None = None
 
-    def open(
-        self, scans: "Described", reading: Reading, seed: int = 0, first_scene: int = 0
-    ) -> DatasetScans:
+    def open(self, scans: "Described", reading: Reading) -> DatasetScans:
         return DatasetScans(self._made(scans))
 
-    def lacks_reflectance(self, scans: "Described", on_bad_scan: str = "error") -> str | None:
+    def lacks_reflectance(
+        self, scans: "Described", reading: Reading | ReadingOptions
+    ) -> str | None:
         channels = len(DatasetScans(self._made(scans))[0])
         return f"the images of {scans.options.name} have one channel" if channels == 1 else None
 
     def _made(self, scans: "Described") -> Any:
+        if scans.dataset is not None:
+            return scans.dataset
         return self.make(None if scans.options.root is None else scans.options.folder)
+
+
+def _not_given(root: Path | None) -> Any:
+    raise InputError("give the data set itself: ScanDataModule(my_dataset, ...).")
+
+
+SOURCES.add(DATASET, DatasetKind(_not_given))

@@ -10,38 +10,25 @@ of labels, `label` uint8 (n, H, W), the common class, 0 for none.
 
 import copy
 import hashlib
-import logging
 import os
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import replace
-from functools import cached_property, partial
+from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from safetensors import safe_open
 
 from r2flow.base.config import at_most_three, differences
-from r2flow.base.errors import InputError, check
+from r2flow.base.errors import InputError
 from r2flow.base.files import reading_errors
-from r2flow.base.progress import Bar, track
+from r2flow.base.registry import Config, Options
 from r2flow.data.layouts import Drive
-from r2flow.data.quantise import OTHER_LEVELS, Codes, find_levels, range_codes, reflectance_codes
-from r2flow.data.reading import Reading, labelled, lacks_reflectance, read_image
-from r2flow.data.sources import (
-    ScanFiles,
-    ScanSource,
-    drives_within,
-    spread,
-    warn_of_other_sensor,
-)
-from r2flow.store import MANIFEST, Damaged, Store, checksum, read_manifest
+from r2flow.data.quantise import Codes, range_codes, reflectance_codes
+from r2flow.data.reading import Reading
+from r2flow.data.sources import ScanSource, drives_within
+from r2flow.store import MANIFEST, Damaged, Store, checksum
 
-log = logging.getLogger(__name__)
-
-KIND = "scans"
-PROJECTION = 4  # revision; increase it when the same files give different images or codes
+_KIND = "scans"
 
 
 class PreparedStore(Store):
@@ -59,11 +46,11 @@ class PreparedStore(Store):
     def __init__(
         self,
         folder: str | Path,
-        recipe: Mapping[str, Any],
+        recipe: Options,
         drives: list[Drive],
         source: ScanSource | None = None,
     ) -> None:
-        super().__init__(folder, KIND, recipe)
+        super().__init__(folder, _KIND, recipe)
         self.drives = drives
         self.source = source
         self.reading = Reading.of(recipe["reading"])
@@ -91,113 +78,14 @@ class PreparedStore(Store):
         return self.source.subset(self.parts[shard]).contents[:16]
 
 
-def plan_files(
-    folder: str | Path,
-    layout: str,
-    root: Path,
-    drives: Sequence[Drive],
-    reading: Reading,
-    shard_scans: int = 64,  # 13 MB at 64 x 1024, held in memory until written
-) -> PreparedStore:
-    """The store in `folder` of scan files in drives below a root; reads some scans for the levels
-    of reflectance.
-    """
-    paths = [path for drive in drives for path in drive.scans]
-    named = [
-        Drive(d.name, tuple(Path(os.path.relpath(p, root)).as_posix() for p in d.scans))
-        for d in drives
-    ]
-    reading = replace(reading, on_bad_scan="error", within_limits=True)
-    warn_of_other_sensor(paths, reading, root)
-    levels = _reflectance_levels(paths, reading)
-    reading = replace(reading, reflectance=levels is not None, labels=labelled(paths) > 0)
-    names = [name for drive in named for name in drive.scans]
-    recipe = {
-        "revision": PROJECTION, "layout": layout, "scans": len(names), "names": checksum(names),
-        "reading": reading.described(), "levels": levels, "shard_scans": shard_scans,
-    }  # fmt: skip
-    return PreparedStore(folder, recipe, named, ScanFiles(paths, reading, root))
-
-
-def _reflectance_levels(paths: Sequence[str], reading: Reading) -> int | None:
-    if lacks_reflectance(paths, "skip", reading.columns) is not None:
-        return None
-    samples = []
-    for index in spread(len(paths), 8):  # enough to see every level
-        with suppress(InputError):  # reported when the scan is prepared
-            samples.append(read_image(Path(paths[index]), replace(reading, reflectance=True))[1])
-    values = np.concatenate(samples) if samples else np.zeros(0)
-    return find_levels(values) if values.any() else OTHER_LEVELS
-
-
-def _make_shard(store: PreparedStore, skip: bool, shard: int) -> None:
-    assert store.source is not None
-    left_out: list[int] = []
-    images: list[np.ndarray] = []
-    for number in store.parts[shard]:
-        try:
-            images.append(store.source[number])
-        except InputError as error:
-            if not skip:
-                raise
-            log.warning("left out: %s", error)
-            left_out.append(number)
-    shape = len(images), len(store.codes), *store.reading.sensor.shape
-    channels = np.reshape(images, shape).swapaxes(0, 1)
-    tensors = {
-        name: coder.encode(channel)
-        for channel, (name, coder) in zip(channels, store.codes.items(), strict=True)
-    }
-    store.write(shard, tensors, {"left_out": left_out, "files": store.sources_of(shard)})
-
-
-def prepare(
-    store: PreparedStore, on_bad_scan: str = "error", workers: int = 1
-) -> tuple[int, list[int]]:
-    """Check the shards of a folder, and make missing or damaged shards; `on_bad_scan="skip"` leaves
-    out unusable scans.
-
-    The headers of the shards have the numbers of the scans left out and a digest of the files:
-    shards of files that have changed since are refused. The result is the number of scans left out,
-    and the shards that were made.
-    """
-    if not store.check() or store.missing(store.shards):  # else the folder may be read-only
-        store.begin(drives=[[drive.name, drive.scans] for drive in store.drives])
-    for shard in track(store.shards, "checking", "shards"):
-        store.mend(shard)
-        file = store.files(shard)[0]
-        check(
-            not file.exists() or store.head(shard).get("files") == store.sources_of(shard),
-            f"{file} holds scans of other files. Give another folder by {store.option}, or remove "
-            "it to make it again.",
-        )
-    missing = store.missing(store.shards)
-    with Bar("preparing", len(missing), "shards") as bar:
-        store.make(
-            missing,
-            partial(_make_shard, store, on_bad_scan == "skip"),
-            workers,
-            lambda shard: bar(),
-        )
-    left_out = sum(len(store.head(shard)["left_out"]) for shard in store.shards)
-    if left_out == len(store.names):
-        for shard in store.shards:  # so that the folder takes another recipe
-            store.files(shard)[0].unlink(missing_ok=True)
-        raise InputError(f"all {left_out} scans were left out as unusable.")
-    return left_out, missing
-
-
-def read_prepared(folder: Path) -> PreparedStore:
+def stored_scans(folder: Path, manifest: Options) -> PreparedStore:
     """The prepared scans in a folder, by its manifest."""
-    try:
-        content = read_manifest(folder, KIND)
-    except FileNotFoundError:
+    if manifest.get("format") != f"r2flow {_KIND}":
         raise InputError(
-            f"{folder} holds no prepared scans (no {MANIFEST}); make them: r2flow prepare."
-        ) from None
-    return PreparedStore(
-        folder, content["recipe"], [Drive(name, tuple(scans)) for name, scans in content["drives"]]
-    )
+            f"{folder} holds no prepared scans (see its {MANIFEST}); make them: r2flow prepare."
+        )
+    drives = [Drive(name, tuple(scans)) for name, scans in manifest["drives"]]
+    return PreparedStore(folder, manifest["recipe"], drives)
 
 
 def refuse_other_images(store: PreparedStore, reading: Reading) -> None:
@@ -264,9 +152,9 @@ class PreparedScans(ScanSource):
         rows = [(number, *places[number]) for number in numbers if number in places]
         #: Rows of (number in the data set, shard, row of the shard).
         self.rows = np.array(rows, dtype=np.int64).reshape(-1, 3)
-        self._shards: dict[int, dict[str, Any]] = {}
+        self._shards: dict[int, Config] = {}
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Config:
         return {**self.__dict__, "_shards": {}}  # memory maps are not pickled
 
     def __len__(self) -> int:
@@ -285,11 +173,11 @@ class PreparedScans(ScanSource):
     def drives(self) -> dict[str, list[int]]:  # type: ignore[override]
         return drives_within({drive.name: drive.scans for drive in self.store.drives}, self.names)
 
-    def about(self) -> dict[str, Any]:
+    def about(self) -> Config:
         kind = f"prepared {self.store.described['layout']}"
         return {"kind": kind, "recipe": self.store.digest[:12], "reflectance": self.reflectance}
 
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> Config:
         rows = checksum(self.rows.tolist())
         return {"recipe": self.contents, "rows": rows, "channels": self.channels}
 

@@ -1,27 +1,27 @@
 """Fill in the defaults of a run's `data`, once."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 from r2flow.base.errors import InputError
-from r2flow.base.registry import construct
-from r2flow.data.opening import SOURCES, Described, Layout, Prepared
+from r2flow.base.registry import Config, Options, construct
+from r2flow.data.described import Described
+from r2flow.data.kinds import SOURCES, Layout, Prepared
 from r2flow.data.options import (
     MIXED,
     PAIRS,
     SIMULATED,
-    Data,
     DataOptions,
     PartOptions,
     ReadingOptions,
     SourceOptions,
 )
-from r2flow.data.reading import scaled_reflectance
-from r2flow.data.sources import readable
+from r2flow.data.reflectance import scaled_reflectance
+from r2flow.data.sensor_checks import readable
 from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
 
-Options = TypeVar("Options", bound=SourceOptions)
+Source = TypeVar("Source", bound=SourceOptions)
 
 # Options that a kind of scans would ignore.
 IGNORED = {
@@ -36,12 +36,18 @@ class DataPlan:
     """The sets of scans of a run, complete: each reading and sensor has all its options."""
 
     sets: Sequence[Described]  # to train on, with `PartOptions`; empty for pairs
+    sensors: Sequence[Sensor]  # of each of `sets`
+    weights: Sequence[float]  # likewise; empty: shares by size
     held_out: Described | None  # to validate on; None: a share of `sets`
     scans: Described | None  # next to pairs
 
+    @property
+    def all(self) -> list[Described]:
+        return [*self.sets, *filter(None, (self.held_out, self.scans))]
 
-def plan_data(options: DataOptions, sensor: Sensor) -> DataPlan:
-    """The sets of scans of a run's `data`, on a sensor.
+
+def plan_data(options: DataOptions, sensor: Sensor, seed: int = 0) -> DataPlan:
+    """The sets of scans of a run's `data`, on a sensor; `seed` is that of simulated scans.
 
     Parts and held-out scans inherit missing keys of the run, except split and drives.
 
@@ -49,12 +55,16 @@ def plan_data(options: DataOptions, sensor: Sensor) -> DataPlan:
         InputError: an unknown data set or option, or one that would be ignored.
     """
     _refuse_ignored("data", options)
-    sets: list[Described] = []
+    inherited = options.reading_fields
+    parts: list[PartOptions] = []
     if options.name == MIXED:
-        sets = _parts(options, sensor)
+        parts = _parts(options)
     elif options.name != PAIRS:
         single = {field.name: getattr(options, field.name) for field in fields(SourceOptions)}
-        sets = [_complete(PartOptions(**single), options.chosen, sensor)]
+        parts = [PartOptions(**single)]
+    sensors = [build_sensor(**part.sensor) if part.sensor else sensor for part in parts]
+    weights = [part.weight for part in parts if part.weight is not None]
+    sets = [_complete(part, inherited, own) for part, own in zip(parts, sensors, strict=True)]
     held_out = None
     if options.validation.data is not None:
         if options.name == PAIRS:
@@ -63,65 +73,69 @@ def plan_data(options: DataOptions, sensor: Sensor) -> DataPlan:
     scans = None
     if options.scans is not None:
         beside = _checked_set("data.scans", SourceOptions, options.scans, options)
-        scans = _complete(beside, _without_scale(options.chosen), sensor)
-    return DataPlan(sets, held_out, scans)
+        scans = _complete(beside, _of_other_files(inherited), sensor)
+    plan = DataPlan(sets, sensors, weights, held_out, scans)
+    first_scene = 0  # parts and held-out scans have different simulated scenes
+    for one in plan.all:
+        one.seed = seed
+        one.first_scene = first_scene
+        first_scene += one.options.scenes if one.options.name == SIMULATED else 0
+    return plan
 
 
-def _without_scale(reading: Data) -> Data:
+def _of_other_files(reading: Config) -> Config:
     """What a reading says of other files, too, with other columns and scale."""
     own = ("columns", "reflectance_scale")
     return {key: value for key, value in reading.items() if key not in own}
 
 
-def _complete(source: SourceOptions, usual: Data, sensor: Sensor) -> Described:
-    """A set of scans with all fields of its reading: its own, else `usual`, else the defaults of
-    its kind.
+def _complete(source: SourceOptions, inherited: Config, sensor: Sensor) -> Described:
+    """A set of scans with all fields of its reading: its own, else `inherited`, else the defaults
+    of its kind.
     """
-    if isinstance(source, PartOptions) and source.sensor:
-        sensor = build_sensor(**source.sensor)
     scans = Described(source.name, source)
     reading = {
         "projection": "spherical",
         "convention": "centre",
         "on_bad_scan": "error",
         "reflectance_scale": scans.scale(sensor.reflectance_scale),
-        **usual,
-        **source.chosen,
+        **inherited,
+        **source.reading_fields,
     }
-    if scans.made_here:
+    if scans.manifests:
         reading["reflectance_scale"] = scans.written_scale
-    return scans.part(reading=ReadingOptions(**reading))
+    scans.options = replace(source, reading=ReadingOptions(**reading))
+    return scans
 
 
-def _parts(run: DataOptions, sensor: Sensor) -> list[Described]:
+def _parts(run: DataOptions) -> list[PartOptions]:
     if not run.parts:
         example = (
             "[{name: kitti_360, root: FOLDER, weight: 3}, {name: folder, root: FOLDER, weight: 1}]"
         )
         raise InputError(f"data=mixed needs its parts: data.parts='{example}'.")
-    parts: list[PartOptions] = []
-    for number, given in enumerate(run.parts):
-        part = {"scenes": run.scenes, **given}
+    parts = []
+    for number, part in enumerate(run.parts):
+        options = {"scenes": run.scenes, **part}
         if part.get("sensor") is not None:
-            part["sensor"] = sensor_options(part["sensor"])
-        parts.append(_checked_set(f"data.parts[{number}]", PartOptions, part, run))
+            options["sensor"] = sensor_options(part["sensor"])
+        parts.append(_checked_set(f"data.parts[{number}]", PartOptions, options, run))
     if len({part.weight is None for part in parts}) > 1:
         raise InputError("data.parts: give every part a weight, or none, for shares by size.")
-    return [_complete(part, run.chosen, sensor) for part in parts]
+    return parts
 
 
-def _held_out(run: DataOptions, other: Mapping[str, Any], sensor: Sensor) -> Described:
-    held = {"name": run.name, "root": run.root, "split": None, "scenes": run.scenes, **other}
-    usual = run.chosen
-    if held["name"] != run.name:
-        usual = _without_scale(usual)
-        held["root"] = other.get("root")
-    return _complete(_checked_set("data.validation.data", SourceOptions, held, run), usual, sensor)
+def _held_out(run: DataOptions, other: Options, sensor: Sensor) -> Described:
+    options = {"name": run.name, "root": run.root, "split": None, "scenes": run.scenes, **other}
+    inherited = run.reading_fields
+    if options["name"] != run.name:
+        inherited = _of_other_files(inherited)
+        options["root"] = other.get("root")
+    held = _checked_set("data.validation.data", SourceOptions, options, run)
+    return _complete(held, inherited, sensor)
 
 
-def _checked_set(
-    what: str, kind: type[Options], options: Mapping[str, Any], run: DataOptions
-) -> Options:
+def _checked_set(what: str, kind: type[Source], options: Options, run: DataOptions) -> Source:
     """One set of scans. Refuses a data set with a standard split of which no part is named."""
     source = construct(what, kind, options)
     if options.get("name") in (None, MIXED, PAIRS):
@@ -149,8 +163,11 @@ def lacking_reflectance(sets: Sequence[Described]) -> str | None:
     """Reason why one of some sets of scans counts as scans without reflectance; None if all have
     reflectance.
     """
-    reasons = (one.kind.lacks_reflectance(one, one.options.chosen["on_bad_scan"]) for one in sets)
-    return next(filter(None, reasons), None)
+    for scans in sets:
+        reading = scans.options.reading
+        if reading and (lacking := scans.kind.lacks_reflectance(scans, reading)):
+            return lacking
+    return None
 
 
 def check_intensities(plan: DataPlan) -> None:
@@ -159,13 +176,13 @@ def check_intensities(plan: DataPlan) -> None:
     Raises:
         InputError: its reflectance goes beyond the scale that training would divide it by.
     """
-    for scans in filter(None, (*plan.sets, plan.held_out, plan.scans)):
+    for scans in plan.all:
         reading = scans.options.reading
         checked = isinstance(scans.kind, Layout) and scans.options.folder.is_dir()
         if checked and reading and reading.on_bad_scan != "skip":
-            for points in readable(scans.paths[:1], reading.columns):
+            for path, points in readable(scans.paths[:1], reading.columns).items():
                 if points.reflectance is not None:
-                    scaled_reflectance(scans.paths[0], points, reading.reflectance_scale)
+                    scaled_reflectance(path, points, reading.reflectance_scale)
 
 
 def reflectance_levels(sets: Sequence[Described]) -> int | None:

@@ -2,11 +2,9 @@
 
 import copy
 import hashlib
-import json
 import logging
 import math
 import os
-import shlex
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -21,24 +19,20 @@ import torch
 from torch import Tensor
 
 from r2flow import simulator
-from r2flow.base.errors import InputError, check, warn_odd
+from r2flow.base.errors import InputError
 from r2flow.base.files import cache_folder
 from r2flow.base.progress import track
+from r2flow.base.registry import Config
 from r2flow.data.reading import Reading, leaving_out, read_image, read_points_image
-from r2flow.lidar.estimation import hangs
 from r2flow.lidar.labels import common_classes, labels_beside
-from r2flow.lidar.matching import Doubt, differing, in_words, is_unclear, other_sensor
-from r2flow.lidar.scan_files import Points, read_points, scan_ending
-from r2flow.lidar.sensors import SENSORS, Sensor
-from r2flow.lidar.turns import SEVERAL, turns
-from r2flow.store import MANIFEST, Damaged, Store, checksum, manifest_of
+from r2flow.lidar.sensors import Sensor
+from r2flow.store import Damaged, Store, checksum
 
 log = logging.getLogger(__name__)
 
 Read = TypeVar("Read")
 
 WORTH_KEEPING = 32  # simulated scans: fewer are simulated again
-LOOKED_AT = 3  # number of scans whose beams are compared with the sensor's
 
 
 class ScanSource(ABC):
@@ -98,11 +92,11 @@ class ScanSource(ABC):
             f"{self.names[index]} holds only ranges, not the measured coordinates of its points."
         )
 
-    def about(self) -> dict[str, Any]:
+    def about(self) -> Config:
         """Metadata to report with metrics of the scans, as plain values without paths."""
         return {}
 
-    def identity(self) -> dict[str, Any] | None:
+    def identity(self) -> Config | None:
         """All that determines the images, as a cache key; None if unknown, so that nothing is
         cached.
         """
@@ -111,112 +105,6 @@ class ScanSource(ABC):
     def places(self) -> set[str]:
         """Paths of the scans' files: two sources with a common path share scans."""
         return set()
-
-
-def made_here(root: str | Path) -> bool:
-    """Whether r2flow wrote the samples or simulated scans in a folder, in all folders in it, or
-    next to a file.
-    """
-    given = Path(root).expanduser()
-    folder = given.parent if given.is_file() else given
-    if not folder.is_dir() or manifest_of(folder):
-        return folder.is_dir()
-    below = [
-        path
-        for path in folder.glob("[!.]*")  # not a disk's .Trash-1000, nor its lost+found
-        if scan_ending(path.name) or (path.is_dir() and os.access(path, os.X_OK))
-    ]
-    return bool(below) and all(map(manifest_of, below))
-
-
-def readable(paths: Sequence[str | Path], columns: Sequence[str] | None) -> Iterator[Points]:
-    """The points of the files that hold points."""
-    for path in paths:
-        with suppress(InputError):
-            yield read_points(path, columns)
-
-
-def mismatch_of(paths: Sequence[str | Path], reading: Reading, ours: bool) -> Doubt | None:
-    """The mismatch of a few scan files and a sensor (`other_sensor`); warns instead of one due to
-    their frame.
-
-    Files of `ours`, that r2flow wrote, store their sensor; other range images have no beams.
-    Unreadable files are reported when they are read as scans.
-    """
-    if ours:
-        sensor = reading.sensor
-        for folder in sorted({os.path.dirname(path) for path in paths}):
-            stored = Reading.stored(folder)
-            theirs = stored.sensor if stored else sensor
-            known = theirs.name in SENSORS
-            if known and theirs.name == sensor.name and theirs.shape[0] >= sensor.shape[0]:
-                continue  # rows of rows are nearly the rows of the sensor
-            if not theirs.resized(*sensor.shape).same_image(sensor):
-                name = theirs.name if known else None
-                return Doubt(f"{MANIFEST} names {theirs}", name, sure=known)
-        return None
-    chosen = [paths[number] for number in spread(len(paths), LOOKED_AT)]
-    scans = {path: scan for path in chosen for scan in readable([path], reading.columns)}
-    mismatch = other_sensor([*scans.values()], reading.sensor) if scans else None
-    if not scans or (mismatch and mismatch.hopeless):
-        return mismatch
-    unclear = warn_of_frame(scans)
-    return None if unclear and not (mismatch and mismatch.sure) else mismatch
-
-
-def warn_of_frame(scans: Mapping[Any, Points], alike: bool = False) -> bool:
-    """Warn, once per folder, of scans (by path) not in one sensor's own frame; whether they are
-    not.
-
-    Warns of files of several turns, too. With `alike`, scans of two sensors are an InputError.
-    """
-    points = [*scans.values()]
-    path = Path(next(iter(scans)))
-    if any(turns(scan) > SEVERAL for scan in points):
-        warn_odd(path, "a file holds several turns of the sensor; a scan is one: split it")
-    if hangs(points):
-        warn_odd(
-            path,
-            "the ground lies above the sensor: if it hangs upside down, negate y and z of the "
-            "points; models expect z upwards",
-        )
-    if pair := differing(points):
-        seen = " and ".join(f"{[*scans][n]} ({in_words(beams)})" for n, beams in pair)
-        check(not alike, f"{seen} are of two sensors: give the scans of each by themselves.")
-        warn_odd(path, f"read as scans of one sensor, but {seen} are of two: read them apart")
-        return True
-    unclear = is_unclear(points)
-    if unclear:
-        warn_odd(
-            path,
-            "its beams are not clear: give scans of one sensor, in its own frame, not a vehicle's",
-        )
-    return unclear
-
-
-def warn_of_other_sensor(
-    paths: Sequence[str | Path], reading: Reading, root: str | Path, ours: bool | None = None
-) -> None:
-    """Warn if scan files do not match a sensor (`mismatch_of`), and name the sensor that matches.
-
-    `ours`: whether r2flow wrote them; None: look (`made_here`).
-    """
-    sensor = reading.sensor
-    mismatch = mismatch_of(paths, reading, made_here(root) if ours is None else ours)
-    if mismatch is None or mismatch.finer:
-        return
-    seen, name, hopeless = mismatch[:3]
-    check(not (hopeless and reading.within_limits), f"{root}: {seen}.")
-    folder = shlex.quote(str(root))
-    advice = f"; give the right one, or estimate it: r2flow sensor {folder} --out mine.yaml"
-    if name is not None and name != sensor.name:
-        advice = (
-            f"; they fit '{name}': sensor={name} in training, --sensor {name} in verbs that have it"
-        )
-    log.warning(
-        "%s: read as scans of sensor '%s', which sees %+.1f to %+.1f degrees, but %s%s",
-        root, sensor.name, *sensor.row_edges[[0, -1]], seen, "" if hopeless else advice,
-    )  # fmt: skip
 
 
 @dataclass(eq=False)
@@ -240,53 +128,57 @@ class ScanFiles(ScanSource):
 
     @property
     def names(self) -> list[str]:
-        below = os.path.join(self.root, "")
-        return [str(path).removeprefix(below) for path in self.paths]
+        return list(map(self._name, self.paths))
+
+    def _name(self, path: str | Path) -> str:
+        return str(path).removeprefix(os.path.join(self.root, ""))
 
     def subset(self, indices: Sequence[int]) -> "ScanFiles":
         paths = [self.paths[i] for i in indices]
         return ScanFiles(paths, self.reading, self.root, described=self.described)
 
-    def about(self) -> dict[str, Any]:
+    def about(self) -> Config:
         return {
             **self.described,
             "files": self._digest[:12],
             "reflectance": bool(self.reading.reflectance),
         }
 
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> Config:
         return {"files": self._digest, **self.reading.described()}
 
     @cached_property
     def _digest(self) -> str:
-        return self._hashed(times=True)
+        """Hash of names, sizes and times of change; a file unpacked anew has another `ctime`."""
+        stats = [(*named, stat.st_mtime_ns, stat.st_ctime_ns) for *named, stat in self._stats()]
+        return checksum(stats)
 
     @property
     def contents(self) -> str:  # type: ignore[override]
-        return self._hashed(times=False)
-
-    def _hashed(self, times: bool) -> str:
-        """Hash of all names and sizes, with `times` also of the times of change, and of the
-        contents of some files.
+        """Hash of names and sizes, and of the contents of some files: unpacked archives can have
+        equal names and sizes.
         """
-        stats: list[Any] = []
         hashes = []
-        paths = [*self.paths]
-        if self.reading.labels:
-            stats += self.reading.label_ids.ids
-            paths += [found for path in paths if (found := labels_beside(path))]
-        for path in paths:
+        files = self._files()
+        for path in [files[number] for number in spread(len(files), 8)]:
+            with suppress(OSError):
+                if os.path.isfile(path):  # a pipe would block, a device never end
+                    with open(path, "rb") as file:
+                        hashes.append(hashlib.file_digest(file, "sha256").hexdigest())
+        return checksum([*(named for *named, _ in self._stats()), *hashes])
+
+    def _files(self) -> list[str | Path]:
+        """The scans' files, and with labels theirs."""
+        found = map(labels_beside, self.paths) if self.reading.labels else ()
+        return [*self.paths, *filter(None, found)]
+
+    def _stats(self) -> Iterator[tuple[Any, ...]]:
+        """Name and size of each file, with labels also the list of their ids; and its `stat`."""
+        ids = self.reading.label_ids.ids if self.reading.labels else None
+        for path in self._files():
             with suppress(OSError):  # reported when the scan is read
                 stat = os.stat(path)
-                name = str(path).removeprefix(os.path.join(self.root, ""))
-                stats.append((name, stat.st_size, *[stat.st_mtime_ns] * times))
-        # Hash some contents, too: unpacked archives can have equal names, sizes and times.
-        for i in spread(len(paths), 8):
-            with suppress(OSError):
-                if os.path.isfile(paths[i]):  # a pipe would block, a device never end
-                    with open(paths[i], "rb") as file:
-                        hashes.append(hashlib.file_digest(file, "sha256").hexdigest())
-        return hashlib.sha256(json.dumps([stats, hashes]).encode()).hexdigest()
+                yield self._name(path), stat.st_size, ids, stat
 
     def places(self) -> set[str]:
         real = cache(os.path.realpath)  # slow on network disks
@@ -357,7 +249,7 @@ class SimulatedScans(MadeScans):
     reflectance: bool
     labels: bool = False  # whether images end with the common class of each ray
 
-    def about(self) -> dict[str, Any]:
+    def about(self) -> Config:
         return {
             "kind": "simulated",
             "seed": self.seed,
@@ -366,7 +258,7 @@ class SimulatedScans(MadeScans):
             "labels": self.labels,
         }
 
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> Config:
         return {
             **self.about(),
             "numbers": checksum([*self.numbers])[:16],

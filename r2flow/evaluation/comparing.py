@@ -10,21 +10,9 @@ from typing import Literal
 
 from r2flow.base.errors import InputError
 from r2flow.base.files import read_json, write_file
-from r2flow.base.plugins import plugin_digests
 from r2flow.base.processes import rank_and_world_size
 from r2flow.data.sets import ScanSet
-from r2flow.evaluation import measuring
-from r2flow.evaluation.measuring import (
-    Cache,
-    MetricResult,
-    Metrics,
-    Statistics,
-    Work,
-    gather_real,
-    measure,
-    speed_result,
-)
-from r2flow.evaluation.protocols import Rules
+from r2flow.evaluation.measuring import Measurer, MetricResult, Statistics, key_of, speed_result
 from r2flow.evaluation.sets import baseline_sets, reference_sets
 from r2flow.metrics.panel import LACKING, PANEL, REFLECTANCE, mean_distance
 from r2flow.store import checksum
@@ -93,19 +81,14 @@ def _without_reflectance(result: MetricResult) -> MetricResult:
 
 
 @dataclass
-class Comparer:
+class Comparer(Measurer):
     """Measures pairs of sets; statistics of a real set are gathered once.
 
     Results of sampled sets are stored in `folder`, if given, in files named by a hash of all that
     they depend on.
     """
 
-    metrics: Metrics
-    work: Work
-    rules: Rules
-    cache: Cache | None
-    folder: Path | None
-    device: str
+    folder: Path | None = None
     _statistics: dict[ScanSet, dict[str, Statistics]] = field(default_factory=dict)
 
     def __call__(self, kind: Kind, name: str, real: ScanSet, other: ScanSet) -> Comparison:
@@ -116,12 +99,11 @@ class Comparer:
                 results = [MetricResult(**entry) for entry in read_json(path)]
                 return Comparison(name, real, other, results, kind)
         if real not in self._statistics:
-            gathered = gather_real(self.metrics, real, self.work, self.cache, self.rules)
-            self._statistics[real] = gathered
-        statistics = self._statistics[real]
-        if kind != "reference" and all(s.empty == s.scans for s in statistics.values()):
+            self._statistics[real] = self.gather(real)
+        truth = self._statistics[real]
+        if kind != "reference" and all(one.empty == one.scans for one in truth.values()):
             raise InputError(f"{real.label}: none of its {len(real)} scans has a return.")
-        results = measure(self.metrics, statistics, other, self.work, self.rules)
+        results = self.measure(truth, other)
         if other.source.drawn:
             results.append(speed_result(real, other))
         if path is not None and rank_and_world_size()[0] == 0:
@@ -132,13 +114,6 @@ class Comparer:
         """File of the results of a sampled set; None for other sets."""
         if self.folder is None or not other.source.drawn:
             return None
-        recipe = {
-            "real": real.identity or [real.label, len(real)],
-            "sampled": other.about,
-            "format": measuring.FORMAT,
-            "metrics": {name: asdict(metric.protocol) for name, metric in self.metrics.items()},
-            "protocol": self.rules.name,
-            "plugins": plugin_digests(),
-            "device": self.device,
-        }
+        keys = [key_of(metric, real, self.rules.name) for metric in self.metrics.values()]
+        recipe = {"real": [real.label, len(real)], "sampled": other.about, "metrics": keys}
         return self.folder / f"{checksum(recipe)[:16]}.json"

@@ -7,7 +7,6 @@ import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +16,7 @@ from r2flow.base.files import cache_folder
 from r2flow.base.plugins import plugin_digests
 from r2flow.base.processes import rank_and_world_size, sum_over_processes
 from r2flow.base.progress import Bar
+from r2flow.base.registry import Options
 from r2flow.data.sets import ScanSet
 from r2flow.evaluation.protocols import R2FLOW, WORDS, Rules
 from r2flow.evaluation.sets import SampledScans
@@ -26,12 +26,20 @@ from r2flow.store import Damaged, Store, checksum
 
 log = logging.getLogger(__name__)
 
-Metrics = Mapping[str, ScanMetric]  # by name
-
-FORMAT = 10  # increment if statistics or figures change for the same scans and protocol
+FORMAT = 11  # increment if statistics or figures change for the same scans and protocol
 # Metrics of single-scan histograms use this many real scans, by a fixed shuffle; metrics of
 # features use all.
 REAL_SCANS = 10_000
+
+Metrics = Mapping[str, ScanMetric]  # by name
+
+
+@dataclass(frozen=True)
+class Work:
+    """Batch size and reader processes; results do not depend on them beyond rounding."""
+
+    batch_size: int = 8  #: scans per batch
+    workers: int = 0  #: additional reader processes
 
 
 @dataclass(frozen=True)
@@ -41,7 +49,18 @@ class Statistics:
     states: Mapping[str, Tensor] = field(repr=False)  #: from `ScanMetric.real_state`
     scans: int
     empty: int  #: scans without a return within the mask
-    chosen: str = ""  #: description of their choice from the set
+    choice: str = ""  #: description of their choice from the set
+
+
+@dataclass(frozen=True)
+class MetricResult:
+    """Results of one metric for one pair of sets."""
+
+    metric: str
+    figures: Mapping[str, float]  #: by name; NaN if undefined, with a remark
+    protocol: Options  #: the metric's, plus set sizes and choice of real scans
+    biased: bool | None  #: as in `ScanMetric`
+    remarks: Sequence[str] = ()
 
 
 class Cache:
@@ -61,9 +80,9 @@ class Cache:
             return None
         return Statistics({name: torch.from_numpy(x) for name, x in states.items()}, **notes)
 
-    def write(self, key: str, statistics: Statistics) -> None:
+    def write(self, key: str, found: Statistics) -> None:
         """Store statistics; only warn if the disk is not writable."""
-        notes = dict(vars(statistics))
+        notes = dict(vars(found))
         states = {name: state.numpy() for name, state in notes.pop("states").items()}
         try:
             self._store(key).write(0, states, notes)
@@ -71,7 +90,7 @@ class Cache:
             log.warning("statistics are not cached: %s: %s", self.folder, error.strerror or error)
 
 
-def key_of(metric: ScanMetric, scans: ScanSet, rule: str) -> str:
+def key_of(metric: ScanMetric, scans: ScanSet, choice: str) -> str:
     """Everything a metric's statistics of a set depend on, as JSON.
 
     The key contains scan files with sizes and times (or seed, or manifest), sensor, projection,
@@ -81,7 +100,7 @@ def key_of(metric: ScanMetric, scans: ScanSet, rule: str) -> str:
     parts = {
         "format": FORMAT,
         "scans": scans.identity,
-        "subset": rule,
+        "subset": choice,
         "protocol": asdict(metric.protocol),
         "plugins": plugin_digests(),
         "device": metric.device.type,
@@ -89,126 +108,139 @@ def key_of(metric: ScanMetric, scans: ScanSet, rule: str) -> str:
     return json.dumps(parts, sort_keys=True)
 
 
-@dataclass(frozen=True)
-class Work:
-    """Batch size and reader processes; results do not depend on them beyond rounding."""
-
-    batch_size: int = 8  #: scans per batch
-    workers: int = 0  #: additional reader processes
-
-
 def bar(doing: str, total: int) -> Bar:
     """Create a progress bar, shown only by the first process."""
     return Bar(doing, total, shown=None if rank_and_world_size()[0] == 0 else False)
 
 
-@dataclass(frozen=True)
-class MetricResult:
-    """Results of one metric for one pair of sets."""
+@dataclass
+class Measurer:
+    """Compares sets of scans by some metrics, under the rules of a protocol."""
 
-    metric: str
-    figures: Mapping[str, float]  #: by name; NaN if undefined, with a remark
-    protocol: Mapping[str, Any]  #: the metric's, plus set sizes and choice of real scans
-    biased: bool | None  #: as in `ScanMetric`
-    remarks: Sequence[str] = ()
+    metrics: Metrics
+    work: Work = Work()
+    rules: Rules = R2FLOW
+    cache: Cache | None = None  # of the statistics of real scans
 
+    def check(self, sets: Iterable[ScanSet]) -> None:
+        """Refuse a set without the reflectance that a metric needs, before reading scans."""
+        needing = [name for name, metric in self.metrics.items() if metric.needs_reflectance]
+        for scans in sets:
+            if needing and not scans.about.get("reflectance", True):
+                raise InputError(
+                    f"{scans.label} has no reflectance, which {', '.join(needing)} needs; leave it "
+                    "out."
+                )
 
-def _real_rule(
-    metric: ScanMetric, real: ScanSet, protocol: Rules = R2FLOW
-) -> tuple[Sequence[int], str]:
-    """Indices of the real scans for a metric and a description of the choice."""
-    count = len(real)
-    if metric.protocol.extractor is not None or count <= REAL_SCANS:
-        return range(count), f"all {count}"
-    return protocol.choose(real, REAL_SCANS), f"{REAL_SCANS} of {count}, {protocol.chosen}"
+    def gather(self, real: ScanSet) -> dict[str, Statistics]:
+        """Compute each metric's statistics of real scans, or read them from the cache."""
+        gathered = {}
+        keys = {}
+        places = self.rules.real
+        points = "" if places == "centre" else f", points {WORDS[places]}"
+        groups: dict[str, list[str]] = {}  # of metrics, by their choice of scans
+        numbers: dict[str, Sequence[int]] = {}
+        for name, metric in self.metrics.items():
+            some, choice = self._chosen_scans(metric, real)
+            if self.cache is not None and real.identity is not None:
+                keys[name] = key_of(metric, real, choice + points)
+                cached = self.cache.read(keys[name])
+                readers = sum_over_processes(torch.tensor(int(cached is not None)))
+                if cached is not None and readers == rank_and_world_size()[1]:  # of all processes
+                    gathered[name] = cached
+                    continue
+            metric.reset()
+            groups.setdefault(choice, []).append(name)
+            numbers[choice] = some
+        for choice, names in groups.items():
+            empty = self._update(names, real, numbers[choice], True)
+            for name in names:
+                states = self.metrics[name].real_state()
+                found = Statistics(states, len(numbers[choice]), empty, choice)
+                gathered[name] = found
+                if self.cache is not None and name in keys:
+                    self.cache.write(keys[name], found)
+        return gathered
 
+    def _chosen_scans(self, metric: ScanMetric, real: ScanSet) -> tuple[Sequence[int], str]:
+        """Numbers of the real scans for a metric, and a description of the choice."""
+        count = len(real)
+        if metric.protocol.extractor is not None or count <= REAL_SCANS:
+            return range(count), f"all {count}"
+        numbers = self.rules.choose(real, REAL_SCANS)
+        return numbers, f"{REAL_SCANS} of {count}, {self.rules.choice}"
 
-def check_reflectance(metrics: Metrics, sets: Iterable[ScanSet]) -> None:
-    """Refuse a set without the reflectance that a metric needs, before reading scans."""
-    needing = [name for name, metric in metrics.items() if metric.needs_reflectance]
-    for scans in sets:
-        if needing and not scans.about.get("reflectance", True):
-            raise InputError(
-                f"{scans.label} has no reflectance, which {', '.join(needing)} needs; leave it out."
-            )
-
-
-def gather_real(
-    metrics: Metrics,
-    real: ScanSet,
-    work: Work,
-    cache: Cache | None = None,
-    protocol: Rules = R2FLOW,
-) -> dict[str, Statistics]:
-    """Compute each metric's statistics of the real scans, or read them from the cache."""
-    points = "" if protocol.real == "centre" else f", points {WORDS[protocol.real]}"
-    gathered = {}
-    keys = {}
-    groups: dict[str, tuple[Sequence[int], dict[str, ScanMetric]]] = {}  # by choice of scans
-    for name, metric in metrics.items():
-        numbers, chosen = _real_rule(metric, real, protocol)
-        if cache is not None and real.identity is not None:
-            keys[name] = key_of(metric, real, chosen + points)
-            cached = cache.read(keys[name])
-            readers = sum_over_processes(torch.tensor(int(cached is not None)))
-            if cached is not None and readers == rank_and_world_size()[1]:  # of all processes
-                gathered[name] = cached
-                continue
-        metric.reset()
-        groups.setdefault(chosen, (numbers, {}))[1][name] = metric
-    for chosen, (numbers, group) in groups.items():
-        empty = _update(group, real, numbers, True, work, protocol)
-        for name, metric in group.items():
-            gathered[name] = Statistics(metric.real_state(), len(numbers), empty, chosen)
-            if cache is not None and name in keys:
-                cache.write(keys[name], gathered[name])
-    return gathered
-
-
-def measure(
-    metrics: Metrics,
-    real: Mapping[str, Statistics],
-    generated: ScanSet,
-    work: Work,
-    protocol: Rules = R2FLOW,
-) -> list[MetricResult]:
-    """Compute all metrics of a generated set.
-
-    `real` are statistics from `gather_real` under the same protocol.
-    """
-    for name, metric in metrics.items():
-        metric.reset()
-        metric.load_real_state(real[name].states)
-    before = getattr(generated.source, "unsolved", 0)
-    empty = _update(metrics, generated, range(len(generated)), False, work, protocol)
-    unsolved = int(
-        sum_over_processes(torch.tensor(getattr(generated.source, "unsolved", 0) - before))
-    )
-    sensor = generated.sensor
-    described = {
-        "name": protocol.name,
-        "points": {"real": WORDS[protocol.real], "generated": WORDS[protocol.generated]},
-        "sensor": sensor.name,
-        "elevations": [max(sensor.elevations), min(sensor.elevations)],
-        "image": list(sensor.shape),
-    }
-    results = []
-    for name, metric in metrics.items():
-        figures = {key: float(value) for key, value in metric.compute().items()}
-        remarks = list(metric.remarks)
-        truth = real[name]
-        if unsolved:
-            remarks.append(f"{unsolved} of {len(generated)} scans are not solved to the tolerance.")
-        sizes = {
-            "real": truth.scans,
-            "real_chosen": truth.chosen,
-            "real_empty": truth.empty,
-            "generated": len(generated),
-            "generated_empty": empty,
+    def measure(self, real: Mapping[str, Statistics], generated: ScanSet) -> list[MetricResult]:
+        """Compute all metrics of a generated set; `real` are statistics from `gather`."""
+        for name, metric in self.metrics.items():
+            metric.reset()
+            metric.load_real_state(real[name].states)
+        before = getattr(generated.source, "unsolved", 0)
+        empty = self._update([*self.metrics], generated, range(len(generated)), False)
+        new = getattr(generated.source, "unsolved", 0) - before
+        unsolved = int(sum_over_processes(torch.tensor(new)))
+        sensor = generated.sensor
+        rules = self.rules
+        described = {
+            "name": rules.name,
+            "points": {"real": WORDS[rules.real], "generated": WORDS[rules.generated]},
+            "sensor": sensor.name,
+            "elevations": [max(sensor.elevations), min(sensor.elevations)],
+            "image": list(sensor.shape),
         }
-        settings = {**described, **asdict(metric.protocol), "sizes": sizes}
-        results.append(MetricResult(name, figures, settings, metric.biased, remarks))
-    return results
+        results = []
+        for name, metric in self.metrics.items():
+            figures = {key: float(value) for key, value in metric.compute().items()}
+            remarks = list(metric.remarks)
+            if unsolved:
+                remarks.append(
+                    f"{unsolved} of {len(generated)} scans are not solved to the tolerance."
+                )
+            truth = real[name]
+            sizes = {
+                "real": truth.scans,
+                "real_chosen": truth.choice,
+                "real_empty": truth.empty,
+                "generated": len(generated),
+                "generated_empty": empty,
+            }
+            settings = {**described, **asdict(metric.protocol), "sizes": sizes}
+            results.append(MetricResult(name, figures, settings, metric.biased, remarks))
+        return results
+
+    def _update(
+        self, names: Sequence[str], scans: ScanSet, numbers: Sequence[int], real: bool
+    ) -> int:
+        """Update metrics with this process's share of scans.
+
+        Returns how many of all scans are empty within the mask.
+        """
+        metrics = [self.metrics[name] for name in names]
+        rank, ranks = rank_and_world_size()
+        size = self.work.batch_size
+        shares = [numbers[i : i + size] for i in range(0, len(numbers), size)][rank::ranks]
+        shared = [number for share in shares for number in share]
+        side = "real" if real else "generated"
+        rays = self.rules.real if real else self.rules.generated
+        measured = rays == "measured"
+        batches = scans.batches(shared, size, self.work.workers, with_points=measured)
+        scan_names = scans.source.names
+        empty = 0
+        last = torch.empty(0)
+        with bar(f"reading {side} scans", len(shared)) as advance, torch.no_grad():
+            for share, read in zip(shares, batches, strict=True):
+                images, points = read if measured else (read, None)
+                if measured or not torch.equal(images, last):  # some baselines repeat one scan
+                    labels = [f"{scan_names[number]} of {scans.label}" for number in share]
+                    place = self.rules.generated if rays == "measured" else rays
+                    there = images.to(metrics[0].device)
+                    batch = Scans(there, scans.sensor, place, points, labels)
+                    last = images
+                empty += int((~batch.nonempty).sum())
+                for metric in metrics:
+                    metric.update(batch, real, share)
+                advance(len(images))
+        return int(sum_over_processes(torch.tensor(empty)))
 
 
 def speed_result(real: ScanSet, generated: ScanSet) -> MetricResult:
@@ -226,42 +258,3 @@ def speed_result(real: ScanSet, generated: ScanSet) -> MetricResult:
     sizes = {"real": len(real), "real_chosen": "none", "generated": len(generated)}
     protocol = {**asdict(Protocol("speed", "network and solver")), "sizes": sizes}
     return MetricResult("speed", figures, protocol, None)
-
-
-def _update(
-    metrics: Metrics,
-    scans: ScanSet,
-    numbers: Sequence[int],
-    real: bool,
-    work: Work,
-    protocol: Rules,
-) -> int:
-    """Update the metrics with this process's share of scans.
-
-    Returns how many of all scans are empty within the mask.
-    """
-    device = next(iter(metrics.values())).device
-    rank, ranks = rank_and_world_size()
-    size = work.batch_size
-    shares = [numbers[i : i + size] for i in range(0, len(numbers), size)][rank::ranks]
-    shared = [number for share in shares for number in share]
-    side = "real" if real else "generated"
-    rays = protocol.real if real else protocol.generated
-    measured = rays == "measured"
-    batches = scans.batches(shared, size, work.workers, with_points=measured)
-    names = scans.source.names
-    empty = 0
-    last = torch.empty(0)
-    with bar(f"reading {side} scans", len(shared)) as advance, torch.no_grad():
-        for share, read in zip(shares, batches, strict=True):
-            images, points = read if measured else (read, None)
-            if measured or not torch.equal(images, last):  # some baselines repeat one scan
-                labels = [f"{names[number]} of {scans.label}" for number in share]
-                place_of = protocol.generated if rays == "measured" else rays
-                batch = Scans(images.to(device), scans.sensor, place_of, points, labels)
-                last = images
-            empty += int((~batch.nonempty).sum())
-            for metric in metrics.values():
-                metric.update(batch, real, share)
-            advance(len(images))
-    return int(sum_over_processes(torch.tensor(empty)))

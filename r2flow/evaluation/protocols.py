@@ -12,7 +12,7 @@ from typing import Literal
 
 from r2flow.base.errors import InputError
 from r2flow.base.registry import Registry
-from r2flow.data.opening import SOURCES
+from r2flow.data.kinds import SOURCES
 from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.lidar.sensors import Convention, Rays
 
@@ -34,8 +34,8 @@ class Rules:
     real: Literal["measured"] | Rays  #: a pixel's point in real scans
     generated: Rays  #: a pixel's point in generated scans
     convention: Convention | None  #: default projection of points to images; None: the model's
-    choose: Callable[[ScanSet, int], Sequence[int]]  #: sorted indices of at most n scans of a set
-    chosen: str  #: description of the choice
+    choose: Callable[[ScanSet, int], Sequence[int]]  #: sorted numbers of at most n scans of a set
+    choice: str  #: its description
 
     def check(self, real: ScanSet) -> None:
         """Refuse a real set whose first scan lacks the measured coordinates that are compared."""

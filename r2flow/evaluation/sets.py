@@ -19,7 +19,7 @@ from r2flow.generators.base import Precision
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.model.paths import checkpoints_of
+from r2flow.model.paths import FOLDER, checkpoints_of
 from r2flow.model.sampling import draw
 from r2flow.model.saving import weights_hash
 from r2flow.model.shipped import MODELS
@@ -30,10 +30,12 @@ AS_MANY = ", as many"  # suffix of a judged set's name
 
 
 def is_checkpoint(text: str) -> bool:
-    """Whether a text names a generator to sample: a checkpoint file, a run folder or a model."""
+    """Whether a text names a generator to sample: a checkpoint file, a run folder, the folder of
+    its checkpoints, or a model.
+    """
     path = Path(text).expanduser()
     if path.is_dir():
-        return bool(checkpoints_of(path)) or any(path.glob("step-*.ckpt"))
+        return bool(checkpoints_of(path.parent if path.name == FOLDER else path))
     if path.suffix in (".ckpt", ".pth", ".safetensors"):
         return True
     return text in MODELS and not path.exists()

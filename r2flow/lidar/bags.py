@@ -5,6 +5,7 @@ are read by the standard definition of PointCloud2, and all other messages stay 
 """
 
 import logging
+import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -76,7 +77,7 @@ class Recording:
 def is_recording(path: str | Path) -> bool:
     """Whether a path names a recording: a file, or the folder of a ROS 2 bag."""
     path = Path(path)
-    return path.suffix.lower() in ENDINGS or (path.is_dir() and _files(path) != [path])
+    return path.suffix.lower() in ENDINGS or _files(path) != [path]
 
 
 @contextmanager
@@ -144,8 +145,9 @@ def _unpacked(message: Message) -> Message:
 
 def _files(path: Path) -> list[Path]:
     """The files of a recording that is a folder, in order; else the path itself."""
+    names = os.listdir(path) if path.is_dir() else []
     for ending in (".mcap", ".db3"):
-        if found := list(path.glob(f"*{ending}")):
+        if found := [path / name for name in names if name.endswith(ending)]:
             return sorted(found, key=lambda file: (len(file.name), file.name))  # 2 before 10
     return [path]
 

@@ -18,10 +18,12 @@ from r2flow.backbones import BACKBONES
 from r2flow.base.errors import IN_MEMORY, InputError, check, naming
 from r2flow.base.files import reading_errors
 from r2flow.base.plugins import made_with
-from r2flow.data.opening import Described, describe, reading_for
+from r2flow.data.described import Described, Spec, describe
+from r2flow.data.detection import reading_for
 from r2flow.data.options import FOLDER as PLAIN
 from r2flow.data.options import SourceOptions
-from r2flow.data.partial import PartialScan, Sight, open_partial, sight
+from r2flow.data.partial import PartialScan, open_partial
+from r2flow.data.seeing import Sight, sight
 from r2flow.generators import Generator, TransferFlow, build_generator
 from r2flow.generators.calibration import Calibration
 from r2flow.lidar.encoding import Encoding
@@ -151,7 +153,7 @@ class Checkpoint:
 
     def open_partial(
         self,
-        specs: Sequence[str],
+        specs: Sequence[Spec],
         sensor: Sensor | str | None = None,
         columns: Sequence[str] | None = None,
         keep_beams: bool = False,
@@ -168,17 +170,18 @@ class Checkpoint:
         reading = reading_for(
             [], self, columns=columns, labels=self.encoding.labels, label_ids=label_ids
         )
-        scans, remarks = open_partial(specs, reading, named, **how)
+        described = [describe(spec) for spec in specs]
+        scans, remarks = open_partial(described, reading, named, **how)
         transfers = isinstance(self.generator, TransferFlow)
         views = {scan.whole for scan in scans}
         if keep_beams and transfers and len(views) == 1 and (view := views.pop()):
             model, scans, remarks = self.through(view).open_partial(
-                specs, sensor, columns, label_ids=label_ids, **how
+                described, sensor, columns, label_ids=label_ids, **how
             )
             size = "x".join(map(str, view.shape))
             remarks.append(f"completed in their own view, as {size}, which keeps all their beams")
             return model, scans, remarks
-        other = remarks and not all(map(self._coarser, specs))
+        other = remarks and not all(map(self._coarser, described))
         return self._without_rows() if other else self, scans, remarks
 
     def _sight(self, points: Points, sensor: Sensor | str | None) -> "tuple[Checkpoint, Sight]":
@@ -239,7 +242,7 @@ class Checkpoint:
             sensor: Sensor of the clouds, by name or YAML file; None: found by the beams of the
                 first one.
             reflectance_scale: Value of full reflectance; None: found for each cloud from its values
-                alone (`r2flow.data.partial.own_scale`).
+                alone (`r2flow.data.seeing.own_scale`).
             columns: Fields to rename, as `intensities=reflectance`; names of the columns of rows.
             fill_gaps: Treat rays without a return as unmeasured, as in a thinned scan.
             how: Options of `r2flow.model.completion.complete`: sampler, precision, ...
@@ -256,9 +259,9 @@ class Checkpoint:
             return self
         return self.through(self.sensor, numbered=False)
 
-    def _coarser(self, spec: str) -> bool:
+    def _coarser(self, scans: Described) -> bool:
         """Whether r2flow wrote some scans as images of this sensor in another size."""
-        stored = describe(spec).stored
+        stored = scans.stored
         return stored is not None and self.sensor.resized(*stored.sensor.shape).same_image(
             stored.sensor
         )

@@ -9,7 +9,7 @@ import torch
 from numpy import ndarray
 
 from r2flow.base.errors import IN_MEMORY, InputError, in_python, naming
-from r2flow.data.partial import Sight
+from r2flow.data.seeing import Sight
 from r2flow.lidar.added import completed_cloud
 from r2flow.lidar.other_sensors import gaps_unknown
 from r2flow.lidar.scan_files import Cloud, Points, points_of

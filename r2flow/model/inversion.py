@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from r2flow.base.errors import InputError
-from r2flow.data.opening import open_scans, reading_for
+from r2flow.data.described import Spec, describe
+from r2flow.data.detection import reading_for
+from r2flow.data.opening import open_scans
 from r2flow.data.reading import AUTO
 from r2flow.generators import Sampler, as_flow
 from r2flow.generators.base import Progress
@@ -22,7 +24,7 @@ _TIGHT = Adaptive(tolerance=1e-5)
 
 def real_scans(
     checkpoint: Checkpoint,
-    specs: Sequence[str | Path],
+    specs: Sequence[Spec],
     reflectance_scale: float | None = None,
     most: int = 16,
     need_reflectance: bool = True,
@@ -36,10 +38,10 @@ def real_scans(
     reflectance = checkpoint.encoding.reflectance and (need_reflectance or AUTO)
     names = []
     images = []
-    for spec in specs:
-        reading = reading_for([spec], checkpoint, reflectance_scale=reflectance_scale)
+    for scans in map(describe, specs):
+        reading = reading_for([scans], checkpoint, reflectance_scale=reflectance_scale)
         reading = replace(reading, reflectance=reflectance, on_bad_scan="error", within_limits=True)
-        source = open_scans(spec, reading).spread(most).source
+        source = open_scans(scans, reading).spread(most).source
         names += [Path(name).name.split(".")[0] for name in source.names]
         images += [torch.from_numpy(source[i]) for i in range(len(source))]
     return names, torch.stack(images)

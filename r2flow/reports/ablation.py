@@ -22,7 +22,6 @@ from r2flow.data.sources import InMemory
 from r2flow.evaluation.comparing import Comparer
 from r2flow.evaluation.copies import find_nearest
 from r2flow.evaluation.measuring import Work
-from r2flow.evaluation.protocols import PROTOCOLS
 from r2flow.evaluation.sets import baseline_sets, sampled_set
 from r2flow.flow.path import interpolate
 from r2flow.flow.straightness import straightness
@@ -58,7 +57,7 @@ class Judge:
     def __post_init__(self) -> None:
         self.counts = panel(self.real[:].numpy(), self.real.sensor)
         metrics = {name: METRICS[name]().to(self.device) for name in _METRICS}
-        self.compare = Comparer(metrics, _WORK, PROTOCOLS["r2flow"], None, None, self.device)
+        self.compare = Comparer(metrics, _WORK)
 
     def figures(self, images: Tensor) -> Row:
         """Figures of a set of images, (N, 2 or 1, H, W). The error of the distance is the

@@ -11,7 +11,7 @@ from numpy import ndarray
 from r2flow.base import noise
 from r2flow.base.errors import InputError
 from r2flow.base.progress import Bar
-from r2flow.data.opening import describe
+from r2flow.data.described import Described, describe
 from r2flow.generators import Sampler, TransferFlow
 from r2flow.generators.base import Progress
 from r2flow.lidar.interpolation import Rule, interpolated
@@ -77,13 +77,14 @@ def report_completion(
         InputError: models of several sensors, a mask that hides nothing, or scans without a return.
     """
     ways = {}
-    for name, model in _models(real, models, sensor, size, device).items():
+    named = describe(real)
+    for name, model in _models(named, models, sensor, size, device).items():
         way = completing(model.generator, several=answers > 1, **sampler)
         ways[f"{name}, {way}"] = (model, way)
     first = next(iter(ways.values()))[0]
     for task in tasks:
         kept_rays(task, first.sensor, 0)
-    _, images = real_scans(first, [real], reflectance_scale, num, need_reflectance=False)
+    _, images = real_scans(first, [named], reflectance_scale, num, need_reflectance=False)
     truths = [image for image in images.numpy() if image[0].any()]
     if not truths:
         raise InputError(f"{real}: no scan has a return, so there is nothing to hide.")
@@ -104,7 +105,7 @@ def report_completion(
 
 
 def _models(
-    real: str, models: Sequence[str], sensor: str | None, size: Any, device: str
+    real: Described, models: Sequence[str], sensor: str | None, size: Any, device: str
 ) -> dict[str, Checkpoint]:
     """Models by name; those of any sensor take the sensor of the others, or of the scans."""
     loaded = {
@@ -112,7 +113,7 @@ def _models(
         for name, path in zip(short_names(models), models, strict=True)
     }
     fixed = [m.sensor for m in loaded.values() if not isinstance(m.generator, TransferFlow)]
-    stored = describe(real).stored
+    stored = real.stored
     known = [*fixed, *([stored.sensor] if stored else [])]
     for name, model in loaded.items():
         if isinstance(model.generator, TransferFlow):

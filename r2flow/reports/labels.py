@@ -10,7 +10,7 @@ from scipy.stats import t as student
 
 from r2flow.base.errors import InputError
 from r2flow.base.progress import track
-from r2flow.data.opening import describe
+from r2flow.data.described import Described, describe
 from r2flow.lidar.labels import (
     COMMON,
     SEMANTIC_KITTI,
@@ -37,9 +37,9 @@ def label_rows(real: str, generated: str, ids: Sequence[str] = ()) -> tuple[list
     Raises:
         InputError: no scan of the same name with labels.
     """
-    lists = [_ids_of(real, ids[:1]), _ids_of(generated, ids[-1:])]
-    truth = _labelled(real)
-    found = _labelled(generated)
+    sets = describe(real), describe(generated)
+    lists = [_ids_of(sets[0], ids[:1]), _ids_of(sets[1], ids[-1:])]
+    truth, found = map(_labelled, sets)
     pairs = [*zip(truth.values(), found.values(), strict=False)]
     if len(truth) != 1 or len(found) != 1:
         pairs = [(truth[name], found[name]) for name in truth if name in found]
@@ -81,15 +81,14 @@ def label_rows(real: str, generated: str, ids: Sequence[str] = ()) -> tuple[list
     return rows, calibration
 
 
-def _ids_of(spec: str, given: Sequence[str]) -> LabelList:
+def _ids_of(scans: Described, ids: Sequence[str]) -> LabelList:
     """The list of the label ids of a name's scans."""
-    stored = describe(spec).stored
-    return stored.label_ids if stored else label_list(next(iter(given), SEMANTIC_KITTI))
+    stored = scans.stored
+    return stored.label_ids if stored else label_list(next(iter(ids), SEMANTIC_KITTI))
 
 
-def _labelled(spec: str) -> dict[str, Path]:
+def _labelled(scans: Described) -> dict[str, Path]:
     """The scans of a name that have labels, by their path without ending."""
-    scans = describe(spec)
     files = {}
     for path in map(points_beside, map(Path, scans.paths)):
         if labels_beside(path):

@@ -14,7 +14,7 @@ from torch import Tensor
 from r2flow.base.config import as_override
 from r2flow.base.errors import InputError
 from r2flow.base.progress import Bar, track
-from r2flow.data.opening import reading_for
+from r2flow.data.detection import reading_for
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.lidar.labels import SEMANTIC_KITTI, LabelList, label_list, write_labels

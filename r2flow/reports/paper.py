@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from r2flow.base.errors import InputError
 from r2flow.base.files import read_json
 from r2flow.base.progress import track
-from r2flow.data.opening import open_scans, reading_for
+from r2flow.data.detection import reading_for
+from r2flow.data.opening import open_scans
 from r2flow.data.sets import ScanSet
 from r2flow.generators import Flow
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint

@@ -153,7 +153,7 @@ def _build_data(
         data = replace(data, reading=theirs)
     elif theirs and not of_simulated:  # the rays of simulated scans are given
         usual = {"projection": theirs.projection, "convention": theirs.convention}
-        data = replace(data, reading=ReadingOptions(**{**usual, **data.chosen}))
+        data = replace(data, reading=ReadingOptions(**{**usual, **data.reading_fields}))
     encoding = dict(options["encoding"])
     if parent is None:
         encoding["reflectance"] = run.encoding.get("reflectance", True)  # `auto` looks at the scans

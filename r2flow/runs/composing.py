@@ -40,7 +40,7 @@ REGISTRIES = {
         ("backbone", "sensor", "encoding", "generator", "sampler", "few", "seed"),
     ),
     "backbone": ("r2flow.backbones", "BACKBONES", ("in_channels", "out_channels", "second_time")),
-    "data": ("r2flow.data.opening", "SOURCES", ()),
+    "data": ("r2flow.data.kinds", "SOURCES", ()),
     "sensor": ("r2flow.lidar.sensors", "SENSORS", ()),
 }
 

@@ -5,11 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from torch.utils.data import Dataset
 
 from r2flow.base import noise
 from r2flow.base.errors import InputError
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.opening import describe
+from r2flow.data.described import describe
 from r2flow.data.prepared import PreparedScans
 from r2flow.data.resolving import reflectance_levels
 from r2flow.data.sources import InMemory, ScanFiles
@@ -367,3 +368,28 @@ def test_images_of_one_channel_are_not_read_into_two(numbered: Path, monkeypatch
     )
     with pytest.raises(InputError, match="found \\(1, "):
         next(iter(module(name="folder", root=str(numbered)).val_dataloader()))
+
+
+class Walls(Dataset):
+    """Scan i is a wall at 5 + i metres."""
+
+    def __len__(self) -> int:
+        return 12
+
+    def __getitem__(self, index: int) -> torch.Tensor:
+        return torch.full((1, *SENSOR.shape), 5.0 + index)
+
+
+def test_a_data_set_itself_is_trained_on(tmp_path: Path):
+    data = ScanDataModule(
+        Walls(), SENSOR, {"reflectance": "auto"}, batch_size=2, validation={"share": 0.25}
+    )
+    data.read()
+    assert numbers(data.training_source) == [*range(9)]
+    assert numbers(data.validation_source) == [9, 10, 11]
+    x_1 = next(iter(data.val_dataloader()))["x_1"]
+    expected = data.encoding.encode(torch.stack([Walls()[9], Walls()[10]]))
+    assert torch.equal(x_1, expected)
+    assert data.fingerprint() != module(name="simulated", scenes=3).fingerprint()
+    with pytest.raises(InputError, match="give the data set itself"):
+        ScanDataModule(**data.hparams).setup()  # a checkpoint does not hold it

@@ -5,11 +5,10 @@ from unittest.mock import Mock
 import pytest
 
 from r2flow.base.errors import InputError
-from r2flow.data.layouts import Layout
-from r2flow.data.opening import SOURCES, find_drives
-from r2flow.data.sources import made_here
+from r2flow.data.described import describe
+from r2flow.data.kinds import SOURCES, Layout
 from r2flow.store import Store
-from tests.conftest import write_scan
+from tests.conftest import find_drives, write_scan
 
 
 def names(drives) -> list[str]:
@@ -104,7 +103,7 @@ def test_a_folder_that_may_not_be_entered_is_left_out_with_its_name(
     monkeypatch.setattr(
         os, "scandir", lambda path: (closed if "lost" in str(path) else scandir)(path)
     )
-    assert made_here(tmp_path)
+    assert describe(tmp_path).manifests
     assert names(find_drives("folder", tmp_path)) == ["day"]
     assert "lost+found: left out, not readable" in caplog.text
 

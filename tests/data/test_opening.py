@@ -14,13 +14,16 @@ import r2flow
 from r2flow.base.errors import InputError
 from r2flow.base.noise import standard_normal
 from r2flow.data.datamodule import ScanDataModule
-from r2flow.data.layouts import Drive, Layout, SourceKind
+from r2flow.data.described import describe
+from r2flow.data.detection import reading_for
+from r2flow.data.kinds import SOURCES, Layout, SourceKind
+from r2flow.data.layouts import Drive
 from r2flow.data.loader import ItemFormat
-from r2flow.data.opening import SOURCES, describe, open_scans, reading_for
+from r2flow.data.opening import open_scans
 from r2flow.data.options import PairOptions
 from r2flow.data.pairs import PairDataset, PairStore, make_pairs
 from r2flow.data.reading import Reading
-from r2flow.data.sources import InMemory, made_here
+from r2flow.data.sources import InMemory
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
@@ -100,7 +103,7 @@ class TestSamples:
         assert len(open_scans(tmp_path)) == 2
         with pytest.raises(InputError, match="give --size 8x32"):
             open_scans(tmp_path).source[0]
-        assert open_scans(tmp_path / "000000.npy", own_size=True).sensor.shape == (8, 32)
+        assert r2flow.read(tmp_path / "000000.npy").shape == (2, 8, 32)
 
     def test_a_damaged_or_unreadable_note_is_one_line(self, tmp_path: Path, monkeypatch):
         self.samples(tmp_path)
@@ -228,7 +231,7 @@ class TestReflectance:
 def test_a_broken_link_is_not_suggested_for_itself(tmp_path: Path):
     (tmp_path / "b.bin").symlink_to(tmp_path / "gone")
     (tmp_path / "loop").symlink_to("loop")
-    assert not made_here(tmp_path)
+    assert not describe(tmp_path).manifests
     with pytest.raises(InputError, match=r"b\.bin is a broken link to .*gone\.$"):
         open_scans(tmp_path / "b.bin")
     (tmp_path / "bb.bin").touch()
@@ -268,7 +271,9 @@ def test_a_function_that_finds_drives_and_one_line_are_a_data_set(tmp_path: Path
     SOURCES.add("bare", Layout(lambda root: []))
     with pytest.raises(InputError, match=r"holds no scan\. Looked for \(bare\): scan files$"):
         open_scans(f"bare:{tmp_path}", READING)
-    SOURCES.add("weeks", Layout(find_weeks, {"train": ("week-1", "week-2"), "test": ("week-3",)}))
+    SOURCES.add(
+        "weeks", Layout(find_weeks, splits={"train": ("week-1", "week-2"), "test": ("week-3",)})
+    )
     for number in range(9):
         write_scan(tmp_path / f"week-{1 + number // 3}" / f"{number}.bin", number)
     assert numbers(open_scans(f"weeks:{tmp_path}", READING, "test").source) == [6, 7, 8]
@@ -284,14 +289,14 @@ def test_a_function_that_finds_drives_and_one_line_are_a_data_set(tmp_path: Path
 class WallKind(SourceKind):
     """Scan i is a wall at i + 2 metres."""
 
-    def open(self, scans, reading, seed=0, first_scene=0) -> InMemory:
+    def open(self, scans, reading) -> InMemory:
         walls = range(2, 2 + int(scans.options.root))
         images = np.ones((1, *reading.sensor.shape), np.float32) * np.float32(walls).reshape(
             -1, 1, 1, 1
         )
         return InMemory(images, [f"wall at {wall} m" for wall in walls])
 
-    def lacks_reflectance(self, scans, on_bad_scan="error") -> str:
+    def lacks_reflectance(self, scans, reading) -> str:
         return "walls have no reflectance"
 
 

@@ -12,14 +12,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from r2flow.base.errors import InputError
-from r2flow.data.opening import find_drives, open_scans
+from r2flow.data.described import describe
+from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading, read_labelled_scan
 from r2flow.lidar.labels import labels_beside
 from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.scan_files.pickled import MOST_STEPS, read_table
 from r2flow.lidar.sensors import SENSORS
-from r2flow.reports.view.panels import list_scans
-from tests.conftest import refused
+from tests.conftest import find_drives, refused
 
 STAMPS = 1_557_539_956.5 + np.arange(4) / 10
 TURN = Rotation.from_euler("zyx", [-45.0, 1.5, 1.2], degrees=True)
@@ -157,7 +157,7 @@ def test_drives_splits_and_labels(tmp_path: Path):
     assert [drive.name for drive in find_drives("pandaset", tmp_path, "test")] == ["115"]
     assert [drive.name for drive in find_drives("pandaset", tmp_path / "002")] == ["002"]
     paths = [tmp_path / name / "lidar/01.pkl.gz" for name in ("002", "115")]
-    assert list_scans(Path(f"pandaset:{tmp_path}"), 8) == (paths, 2)
+    assert describe(f"pandaset:{tmp_path}").some(8) == list(map(str, paths))
     scans = open_scans(f"pandaset:{tmp_path}")
     image = scans.source[0]
     assert image.shape == (2, 64, 1024)

@@ -16,10 +16,12 @@ from safetensors.numpy import load_file
 
 from r2flow.base.errors import InputError
 from r2flow.data.datamodule import ScanDataModule
+from r2flow.data.described import Described, describe
+from r2flow.data.kinds import SOURCES
 from r2flow.data.layouts import Drive
-from r2flow.data.opening import SOURCES, Described, find_drives
 from r2flow.data.options import SourceOptions
-from r2flow.data.prepared import PreparedStore, plan_files, prepare, refuse_other_images
+from r2flow.data.prepared import PreparedStore, refuse_other_images
+from r2flow.data.preparing import plan, prepare
 from r2flow.data.quantise import find_levels, range_codes, reflectance_codes
 from r2flow.data.reading import Reading, read_image
 from r2flow.data.sources import ScanFiles
@@ -27,7 +29,7 @@ from r2flow.lidar.labels import COMMON
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.store import MANIFEST, read_manifest
-from tests.conftest import ROOT, files, refused
+from tests.conftest import ROOT, files, find_drives, refused
 from tests.killing import MOMENTS, die_at, in_child
 from tests.training.conftest import TINY, in_process
 
@@ -65,13 +67,11 @@ def clouds(tmp_path_factory) -> Path:
 def plan_of(
     root: Path, sensor: Sensor = SMALL, layout: str = "folder", shard_scans: int = 3, **how
 ) -> PreparedStore:
-    return plan_files(
-        "unused", layout, root, find_drives(layout, root), Reading(sensor, **how), shard_scans
-    )
+    return plan("unused", describe(f"{layout}:{root}"), Reading(sensor, **how), shard_scans)
 
 
-def make(folder: Path, plan: PreparedStore, **options) -> Path:
-    prepare(PreparedStore(folder, plan.described, plan.drives, plan.source), **options)
+def make(folder: Path, planned: PreparedStore, **options) -> Path:
+    prepare(PreparedStore(folder, planned.described, planned.drives, planned.source), **options)
     return folder
 
 
@@ -160,12 +160,12 @@ def test_prepared_scans_are_the_raw_ones_to_the_stated_quantisation(clouds: Path
 )
 def test_real_scans_keep_their_reflectance_to_the_bit(shared, tmp_path, layout, folder, most):
     sensor = SENSORS["hdl64e"]
-    plan = plan_of(shared / "real" / folder, sensor, layout)
+    planned = plan_of(shared / "real" / folder, sensor, layout)
     few = PreparedStore(
         tmp_path,
-        {**plan.described, "scans": most},
-        [Drive("few", plan.drives[0].scans[:most])],
-        plan.source,
+        {**planned.described, "scans": most},
+        [Drive("few", planned.drives[0].scans[:most])],
+        planned.source,
     )
     prepared = prepared_in(make(tmp_path, few), sensor)
     assert few.described["levels"] == (256 if layout == "kitti_360" else 100)
@@ -232,9 +232,11 @@ def test_scans_prepared_for_other_images_are_refused(
         make(tmp_path, plan_of(clouds, replace(SMALL, **changes), **options))
     # no pixel depends on these
     prepared_in(tmp_path, replace(SMALL, name="mine", height=2.0, firing=(1, 0, 2, 3)))
-    plan = plan_of(clouds, projection="unfolding")
+    planned = plan_of(clouds, projection="unfolding")
     with refused("firing=None there"):
-        refuse_other_images(plan, replace(plan.reading, sensor=replace(SMALL, firing=(1, 0, 2, 3))))
+        refuse_other_images(
+            planned, replace(planned.reading, sensor=replace(SMALL, firing=(1, 0, 2, 3)))
+        )
 
 
 def test_other_files_of_the_same_names_are_refused_and_a_mended_one_is_taken(
@@ -279,16 +281,16 @@ def test_bad_scans_stop_the_preparation_or_are_left_out_by_name(
         "drive0/000005.bin",
     ):
         (root / name).write_bytes(b"")
-    plan = plan_of(root)
+    planned = plan_of(root)
     with pytest.raises(InputError, match=r"000001.bin: it holds no points"):
-        make(tmp_path / "out", plan)
+        make(tmp_path / "out", planned)
     with pytest.raises(
         InputError, match="is not finished: the same r2flow prepare command resumes"
     ):
         prepared_in(tmp_path / "out", SMALL)
-    make(tmp_path / "out", plan, on_bad_scan="skip")
+    make(tmp_path / "out", planned, on_bad_scan="skip")
     assert caplog.text.count("left out:") == 4
-    shards = PreparedStore(tmp_path / "out", plan.described, plan.drives, plan.source)
+    shards = PreparedStore(tmp_path / "out", planned.described, planned.drives, planned.source)
     assert (*prepare(shards), [shards.head(i)["left_out"] for i in shards.shards]) == (
         4,
         [],
@@ -322,15 +324,15 @@ def test_a_scan_that_has_no_reflectance_among_others_is_a_bad_one(tmp_path: Path
 
 
 def test_killed_again_and_again_the_same_command_ends_alike(clouds: Path, tmp_path: Path):
-    plan = plan_of(clouds, shard_scans=1)
-    one = files(make(tmp_path / "one", plan))
+    planned = plan_of(clouds, shard_scans=1)
+    one = files(make(tmp_path / "one", planned))
     folder, kept = tmp_path / "killed", []
     for dies in MOMENTS:
-        child = in_child(lambda: (die_at(*dies), make(folder, plan)))  # noqa: B023
+        child = in_child(lambda: (die_at(*dies), make(folder, planned)))  # noqa: B023
         assert os.waitpid(child, 0)[1] == signal.SIGKILL
         kept.append(len(list(folder.glob("scans-*"))))
     assert kept == sorted(kept)  # what was whole stays
-    assert files(make(folder, plan)) == one
+    assert files(make(folder, planned)) == one
 
 
 def swapped(path: Path) -> None:
@@ -352,8 +354,8 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_shard_is_refused_by_name_and_made_again(clouds: Path, tmp_path: Path, damage):
-    plan = plan_of(clouds)
-    opened, whole = prepared_in(make(tmp_path, plan)), files(tmp_path)
+    planned = plan_of(clouds)
+    opened, whole = prepared_in(make(tmp_path, planned)), files(tmp_path)
     path = tmp_path / "scans-000001.safetensors"
     DAMAGES[damage](path)
     if damage not in ("swapped", "renamed"):
@@ -368,7 +370,7 @@ def test_a_damaged_shard_is_refused_by_name_and_made_again(clouds: Path, tmp_pat
         prepared_in(tmp_path)
     if damage == "folder":
         path.rmdir()
-    _, made = prepare(PreparedStore(tmp_path, plan.described, plan.drives, plan.source))
+    _, made = prepare(PreparedStore(tmp_path, planned.described, planned.drives, planned.source))
     assert made == ([1, 2] if damage == "swapped" else [1])  # these alone
     assert files(tmp_path) == whole
 

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from r2flow.base.errors import InputError
-from r2flow.data.reading import Reading, scaled_reflectance
-from r2flow.data.sources import warn_of_frame, warn_of_other_sensor
+from r2flow.data.described import describe
+from r2flow.data.reading import Reading
+from r2flow.data.reflectance import scaled_reflectance
+from r2flow.data.sensor_checks import warn_of_frame, warn_of_other_sensor
 from r2flow.lidar.beams import FIRINGS, RING_AFTER_RING, RINGS, UNORDERED, find_beams
 from r2flow.lidar.estimation import estimate_sensor, full_reflectance
 from r2flow.lidar.matching import differing, is_tilted, nearest_sensor, other_sensor
@@ -17,6 +19,7 @@ from r2flow.lidar.scan_files import Points, read_points, write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.unfolding import elevations_of
 from r2flow.simulator import simulate
+from tests.conftest import refused
 
 HEIGHT, WALL = 1.6, 25.0
 
@@ -167,19 +170,18 @@ def test_the_scale_of_reflectance_is_estimated(values, scale):
     assert full_reflectance([points]) == scale
     assert full_reflectance([Points(points.xyz)]) is None
     if scale:
-        assert scaled_reflectance("a.bin", points, scale).max() == pytest.approx(
+        assert scaled_reflectance("a.bin", points, scale)[0].max() == pytest.approx(
             min(values.max() / scale, 1)
         )
-    assert scaled_reflectance(
-        "a.bin", Points(np.ones((3, 3)), np.float32([0, 0.5, 1])), 255
-    ).tolist() == [0, 0.5, 1]
+    fractions = Points(np.ones((3, 3)), np.float32([0, 0.5, 1]))
+    assert scaled_reflectance("a.bin", fractions, 255)[0].tolist() == [0, 0.5, 1]
 
 
 @pytest.mark.parametrize(("scale", "dark"), [(1, False), (65535, True)])
 def test_outliers_of_reflectance_are_clipped_with_a_warning(tmp_path, caplog, scale, dark):
     values = np.append(np.full(997, 0.3), [2e4] * 3).astype(np.float32)
     points = Points(np.ones((1000, 3), np.float32), values + (0 if scale == 1 else 1))
-    scaled = scaled_reflectance(tmp_path / "a.bin", points, scale)
+    scaled, _ = scaled_reflectance(tmp_path / "a.bin", points, scale)
     np.testing.assert_allclose(scaled, (points.reflectance / scale).clip(0, 1), rtol=1e-6)
     assert ("reflectance beyond 1 is clipped (3 points" in caplog.text) == (scale == 1)
     assert ("half of it below a hundredth" in caplog.text) == dark
@@ -364,7 +366,7 @@ def test_two_sensors_in_one_file_are_warned_of(tmp_path: Path, caplog, ringed: b
     ]
     rings = np.concatenate([one.ring, other.ring]) if ringed else None
     write_points(tmp_path / "0.ply", np.concatenate(xyz), ring=rings)
-    warn_of_other_sensor([tmp_path / "0.ply"], Reading(SENSORS["vlp16"]), tmp_path)
+    warn_of_other_sensor(describe(tmp_path), Reading(SENSORS["vlp16"]))
     assert (
         "give scans of one sensor, in its own frame" if ringed else "degrees off its beams"
     ) in caplog.text
@@ -376,7 +378,10 @@ def test_points_in_the_frame_of_a_pitched_vehicle_are_found(name: str):
     for degrees, tilted in ((0, False), (0.5, False), (2, True), (-5, True)):
         assert is_tilted([pitched(level, degrees)]) == tilted, degrees
     other = scan(SENSORS["os1_64" if name == "vlp16" else "vlp16"].resized(columns=384), UNORDERED)
-    assert [warn_of_frame({name: level, "2": second}) for second in (level, other)] == [False, True]
+    pairs = [{name: level, "2": second} for second in (level, other)]
+    assert [warn_of_frame(pair, named=True) for pair in pairs] == [False, True]
+    with refused("are of two sensors"):
+        warn_of_frame(pairs[1])
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -452,15 +457,11 @@ def test_sensors_of_one_s_own_are_judged_by_their_beams():
 def test_rows_between_the_beams_of_ones_own_sensor_are_no_other_sensors(tmp_path: Path, caplog):
     for beams, rows in ((SENSORS["vlp16"], 32), (SENSORS["vlp16"], 64), (MINE, 27)):
         write_points(tmp_path / "0.ply", scan(beams, RING_AFTER_RING).xyz)
-        warn_of_other_sensor(
-            [tmp_path / "0.ply"],
-            Reading(Sensor("my_own", beams.elevations).resized(rows)),
-            tmp_path,
-        )
+        own = Sensor("my_own", beams.elevations).resized(rows)
+        warn_of_other_sensor(describe(tmp_path), Reading(own))
         assert not caplog.text
-    warn_of_other_sensor(
-        [tmp_path / "0.ply"], Reading(Sensor("my_own", SENSORS["vlp16"].elevations)), tmp_path
-    )
+    own = Sensor("my_own", SENSORS["vlp16"].elevations)
+    warn_of_other_sensor(describe(tmp_path), Reading(own))
     assert "give the right one" in caplog.text
 
 
@@ -496,9 +497,7 @@ def test_scanners_without_beams_are_refused_with_the_reason(tmp_path: Path, patt
         find_beams(scan)
     write_points(tmp_path / "0.ply", scan.xyz)
     with pytest.raises(InputError, match="lie on no beams"):
-        warn_of_other_sensor(
-            [tmp_path / "0.ply"], Reading(SENSORS["hdl64e"], within_limits=True), tmp_path
-        )
+        warn_of_other_sensor(describe(tmp_path), Reading(SENSORS["hdl64e"], within_limits=True))
     assert all(other_sensor([scan], sensor).hopeless for sensor in SENSORS.values())
     with pytest.raises(
         InputError, match="lie on no beams"

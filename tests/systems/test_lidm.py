@@ -18,7 +18,7 @@ from torch import Tensor
 from r2flow.base.errors import InputError
 from r2flow.base.noise import Draws
 from r2flow.base.registry import options_of
-from r2flow.data.opening import reading_for
+from r2flow.data.detection import reading_for
 from r2flow.generators import build_generator
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import project, unproject

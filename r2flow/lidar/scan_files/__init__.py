@@ -9,7 +9,7 @@ write_points("000000.ply", points.xyz, points.reflectance)
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -75,6 +75,7 @@ FIRM_ENDINGS = tuple(
     ending for ending in SCAN_ENDINGS if ending not in LOOSE_ENDINGS + TABLE_ENDINGS
 )
 
+_KEPT = 4  # files last read, which are looked at several times: for their sensor, their reflectance
 FARTHEST_RAY = 400.0  # metres; no spinning LiDAR measures farther
 LARGEST_FILE = 1 << 30  # bytes: 67 million points, hundreds of scans; more exhausts the memory
 
@@ -111,6 +112,24 @@ def read_cloud(path: str | Path, columns: Sequence[str] | None = None) -> Cloud:
     """All fields of a scan file, as stored; `columns` and errors as of `read_points`."""
     path = Path(path)
     check_columns(columns)
+    cloud = _read_cloud(path, columns and tuple(columns), _state_of(path))
+    if cloud.named or not beside(path).is_file():
+        return cloud
+    with reading_errors(path):
+        return _with_beside(path, cloud)
+
+
+def _state_of(path: Path) -> tuple[int, ...]:
+    """What changes with a file; empty without one."""
+    try:
+        stat = path.stat()
+    except (OSError, ValueError):  # the reader reports it
+        return ()
+    return stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
+
+
+@lru_cache(_KEPT)
+def _read_cloud(path: Path, columns: Sequence[str] | None, state: tuple[int, ...]) -> Cloud:
     ending = scan_ending(path.name)
     if not ending and path.exists():
         known = ", ".join(SCAN_ENDINGS)
@@ -119,12 +138,12 @@ def read_cloud(path: str | Path, columns: Sequence[str] | None = None) -> Cloud:
     raw = ending in _ROWS
     with reading(path, LARGEST_FILE, "scan file", least=0 if raw else 1):
         if raw:
-            return _with_beside(path, tables.read_rows(path, columns))
+            return tables.read_rows(path, columns)
         cloud = _READERS[ending](path)
         if cloud.named:
             return cloud.renamed(columns)
         names = tuple(tables.column_names(len(cloud.columns), columns))
-        return _with_beside(path, replace(cloud, names=names))
+        return replace(cloud, names=names)
 
 
 def beside(path: Path) -> Path:
@@ -133,9 +152,7 @@ def beside(path: Path) -> Path:
 
 
 def _with_beside(path: Path, cloud: Cloud) -> Cloud:
-    """The cloud with the fields in the file beside it, if there is one."""
-    if not beside(path).is_file():
-        return cloud
+    """The cloud with the fields in the file beside it."""
     with np.load(beside(path)) as stored:
         fields = {name: stored[name] for name in stored.files}
     if any(column.shape[:1] != (len(cloud),) for column in fields.values()):
@@ -223,9 +240,16 @@ def read_range_image(path: str | Path) -> ndarray | None:
 
 
 def read_numbers(path: str | Path) -> ndarray:
-    """The array of numbers in a .npy, of any shape and type, read without unpickling."""
-    with reading(Path(path), LARGEST_FILE, ".npy file"):
-        return tables.read_array(Path(path))
+    """The array of numbers in a .npy, of any shape and type, read without unpickling; read-only."""
+    return _read_numbers(Path(path), _state_of(Path(path)))
+
+
+@lru_cache(_KEPT)
+def _read_numbers(path: Path, state: tuple[int, ...]) -> ndarray:
+    with reading(path, LARGEST_FILE, ".npy file"):
+        array = tables.read_array(path)
+    array.flags.writeable = False
+    return array
 
 
 def write_points(

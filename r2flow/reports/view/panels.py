@@ -10,18 +10,14 @@ from numpy import ndarray
 
 from r2flow.base.errors import InputError
 from r2flow.base.progress import Bar
-from r2flow.data.opening import SOURCES, describe, find_drives, open_scans
+from r2flow.data.described import Described
+from r2flow.data.opening import open_each, open_scans
 from r2flow.data.options import FOLDER, SIMULATED
-from r2flow.data.reading import Reading, estimated_scale, read_labelled_scan
+from r2flow.data.reading import Reading, read_labelled_scan
+from r2flow.data.reflectance import estimated_scale
+from r2flow.data.sensor_checks import readable, warn_of_other_sensor
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import (
-    ScanFiles,
-    ScanSource,
-    SimulatedScans,
-    readable,
-    spread,
-    warn_of_other_sensor,
-)
+from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans
 from r2flow.lidar.labels import SEMANTIC_KITTI, labels_beside
 from r2flow.lidar.scan_files import points_beside, read_range_image
 from r2flow.model.checkpoint import Checkpoint
@@ -30,64 +26,51 @@ from r2flow.reports.view import Panel, panel_of, write_viewer
 from r2flow.simulator import simulate
 
 
-def list_scans(path: Path, most: int) -> tuple[list[Path], int]:
-    """A scan file, or up to `most` scans of a folder or `NAME:FOLDER`, evenly spread; and the
-    number of all.
-    """
-    name, _, root = str(path).partition(":")
-    if name in SOURCES and not path.exists():
-        drives = find_drives(name, root)
-    elif path.is_dir():
-        drives = find_drives(FOLDER, path)
-    else:
-        return [path], 1
-    paths = [Path(scan) for drive in drives for scan in drive.scans]
-    return [paths[index] for index in spread(len(paths), most)], len(paths)
-
-
-def share_scale(readings: Mapping[str, Reading], most: int) -> dict[str, Reading]:
+def share_scale(readings: Mapping[Described, Reading], most: int) -> dict[Described, Reading]:
     """Readings of sets shown together: those without full reflectance take one estimate from all of
     them.
     """
-    unknown = [spec for spec, reading in readings.items() if reading.reflectance_scale is None]
-    paths = []
-    for scans in map(describe, unknown):
-        paths += list_scans(scans.file or scans.options.folder, most)[0]
+    unknown = [scans for scans, reading in readings.items() if reading.reflectance_scale is None]
+    paths = [path for scans in unknown for path in scans.some(most)]
     if not paths:
         return dict(readings)
-    scale = estimated_scale(paths[0], readable(paths, readings[unknown[0]].columns))
-    scaled = {spec: replace(readings[spec], reflectance_scale=scale) for spec in unknown}
+    points = readable(paths, readings[unknown[0]].columns)
+    scale = estimated_scale(paths[0], points.values())
+    scaled = {scans: replace(readings[scans], reflectance_scale=scale) for scans in unknown}
     return {**readings, **scaled}
 
 
-def scan_panels(readings: Mapping[str, Reading], most: int) -> Iterator[tuple[str, Panel]]:
+def scan_panels(
+    readings: Mapping[Described, Reading], most: int
+) -> Iterator[tuple[Described, Panel]]:
     """Sets and a panel for each of up to `most` scans of them, evenly spread, with their labels.
 
     The caption is the file name, with folders if names are ambiguous. Files not written by r2flow
     are opened one by one, since sizes of range images and reflectance may differ.
     """
-    views = []
-    for spec, reading in readings.items():
+    views: list[tuple[Described, Path, ScanSet, int]] = []
+    for scans, reading in readings.items():
         reading = replace(reading, on_bad_scan="error")
-        described = describe(spec)
-        options = described.options
-        if described.stored is None and options.name == FOLDER:
-            chosen, total = list_scans(described.file or options.folder, most)
-            warn_of_other_sensor(chosen, reading, spec)
-            views += [(spec, path, open_scans(path, reading, own_size=True), 0) for path in chosen]
+        if scans.stored is None and scans.options.name == FOLDER:
+            warn_of_other_sensor(scans, reading)
+            total = len(scans.paths)
+            paths = scans.some(most)
+            each = open_each(scans, paths, reading)
+            views += [(scans, Path(path), one, 0) for path, one in zip(paths, each, strict=True)]
         else:
-            opened = open_scans(spec, reading)
+            opened = open_scans(scans, reading)
             total = len(opened)
-            scans = opened.spread(most)
-            names = enumerate(scans.source.names)
-            views += [(spec, options.folder / name, scans, number) for number, name in names]
-        if total > most and options.name != SIMULATED:  # simulated sets have any size
-            print(f"{spec}: {most} of its {total:,} scans, evenly spread (--num)")
+            some = opened.spread(most)
+            folder = Path(str(scans.options.root or ""))
+            names = enumerate(some.source.names)
+            views += [(scans, folder / name, some, number) for number, name in names]
+        if total > most and scans.options.name != SIMULATED:  # simulated sets have any size
+            print(f"{scans.label}: {most} of its {total:,} scans, evenly spread (--num)")
     captions = short_names([path for _, path, *_ in views])
-    for (spec, _, scans, number), caption in zip(views, captions, strict=True):
-        image = scans.source[number]
-        classes = _read_labels(scans.source, number)
-        yield spec, Panel(caption, image[None], scans.sensor.rays(), classes)
+    for (scans, _, opened, number), caption in zip(views, captions, strict=True):
+        image = opened.source[number]
+        classes = _read_labels(opened.source, number)
+        yield scans, Panel(caption, image[None], opened.sensor.rays(), classes)
 
 
 def _read_labels(source: ScanSource, number: int) -> ndarray | None:

@@ -20,8 +20,8 @@ from r2flow.base.errors import InputError, check
 from r2flow.base.files import write_file
 from r2flow.base.progress import track
 from r2flow.data.opening import open_scans
-from r2flow.data.partial import seeing_all
 from r2flow.data.reading import Reading
+from r2flow.data.seeing import seeing_all
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor, named_sensor
 from r2flow.model.checkpoint import Checkpoint
