@@ -26,7 +26,7 @@ from typing import Any
 import lightning as L
 import torch
 
-from r2flow.backbones import Backbone, build_backbone, configurations
+from r2flow.backbones import BACKBONES, Backbone
 from r2flow.base.errors import InputError
 from r2flow.lidar.sensors import build_sensor
 from r2flow.reports.backbones import RULE, count_macs, count_parameters
@@ -56,11 +56,11 @@ def built(config: str, rows: int, columns: int, attention: str, device: str) -> 
     """The backbone of a configuration on the paper's sensor; weights that start at zero are drawn
     instead.
     """
-    options = configurations()[config]
+    options = BACKBONES.options(config)
     if options["name"] == "hdit":
         options["attention"] = attention
     torch.manual_seed(0)
-    model = build_backbone(options, build_sensor("hdl64e", rows, columns).rays(), 2)
+    model = BACKBONES.build(options, build_sensor("hdl64e", rows, columns).rays())
     for parameter in model.parameters():
         if not parameter.any():
             torch.nn.init.normal_(parameter, std=0.02)

@@ -29,7 +29,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import t as student
 from torch import Tensor, nn
 
-from r2flow.backbones import build_backbone
+from r2flow.backbones import BACKBONES
 from r2flow.data.reading import Reading, read_image
 from r2flow.data.sources import SimulatedScans
 from r2flow.lidar.labels import COMMON
@@ -101,7 +101,9 @@ class Segmenter(nn.Module):
     def __init__(self, sensor: Sensor, channels: int = 48) -> None:
         super().__init__()
         rays = sensor.resized(*CROP).rays()
-        self.network = build_backbone({"name": "local", "channels": channels}, rays, 5, CLASSES)
+        self.network = BACKBONES.build(
+            {"name": "local", "channels": channels}, rays, in_channels=5, out_channels=CLASSES
+        )
 
     def forward(self, scan: Tensor, elevations: Tensor) -> Tensor:
         """Logits, (B, K, h, w), of scans (B, 2, h, w) with elevations in radians, (B, h)."""

@@ -72,10 +72,10 @@ def training(name: str, rounded: bool = False) -> Work:
     """A training step on one image of 2 x 64 x 1024: forward, backward and AdamW."""
     import torch
 
-    from r2flow.backbones import build_backbone, configurations
+    from r2flow.backbones import BACKBONES
     from r2flow.lidar.sensors import SENSORS
 
-    model = build_backbone(configurations()[name], SENSORS["hdl64e"].rays(), 2)
+    model = BACKBONES.build(name, SENSORS["hdl64e"].rays())
     optimiser = torch.optim.AdamW(model.parameters())
     x = torch.randn(1, 2, 64, 1024)
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from r2flow.backbones import Backbone, build_backbone
+from r2flow.backbones import BACKBONES, Backbone
 
 SCALES = {
     "half": 0.5,
@@ -66,8 +66,10 @@ def backbone_of(name: str, case: dict[str, Any]) -> Backbone:
     options = {
         OPTIONS.get(key, key): value for key, value in cfg.items() if key in (*OPTIONS, *KEPT)
     }
-    model = build_backbone(
-        {"name": name, **options}, torch.zeros(2, *cfg["resolution"]), cfg["in_channels"]
+    model = BACKBONES.build(
+        {"name": name, **options},
+        torch.zeros(2, *cfg["resolution"]),
+        in_channels=cfg["in_channels"],
     )
     model.load_state_dict(case["state_dict"])
     return model

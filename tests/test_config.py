@@ -11,10 +11,10 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from r2flow.callbacks import CALLBACKS
 
-from r2flow.backbones import BACKBONES, configurations
+from r2flow.backbones import BACKBONES
 from r2flow.base.config import as_override, flatten, key_of, rules_in
 from r2flow.base.errors import InputError
-from r2flow.base.registry import options_of
+from r2flow.base.registry import options_of, presets
 from r2flow.data.augment import Augmentation
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.options import DataOptions, PairOptions, ReadingOptions, ValidationOptions
@@ -256,7 +256,7 @@ def test_a_chosen_backbone_is_whole_at_every_size(backbone: str):
         composed = compose(
             ["experiment=r2dm", f"size={size}", "data.root=x", f"backbone={backbone}"]
         )
-        assert composed["backbone"] == configurations()[backbone]
+        assert composed["backbone"] == presets("backbone")[backbone]
 
 
 @pytest.mark.parametrize("asked", ["backbone=hdit_small", "backbone.depths=[1]"])

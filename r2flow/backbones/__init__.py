@@ -14,7 +14,7 @@ from r2flow.backbones.local import Local
 from r2flow.backbones.own import OWN, own_backbone
 from r2flow.backbones.vit import ViT
 from r2flow.base.errors import InputError
-from r2flow.base.registry import Config, Options, Registry, construct, presets
+from r2flow.base.registry import Config, Options, Registry, presets
 from r2flow.lidar.sensors import SENSORS
 
 
@@ -25,15 +25,17 @@ class _Backbones(Registry[Callable[..., Backbone]]):
         return iter(sorted({*self._entries, *presets(self.kind)}))
 
     def __len__(self) -> int:
-        return len({*self._entries, *presets(self.kind)})
+        return len([*self])
 
     def __contains__(self, name: object) -> bool:
         return name in presets(self.kind) or super().__contains__(name)
 
     def __getitem__(self, name: str) -> Callable[..., Backbone]:
+        if name == OWN:
+            return own_backbone
         if name in self._entries or name not in self:
             return super().__getitem__(name)
-        options = dict(presets(self.kind)[name])
+        options = self.options(name)
         return partial(self[options.pop("name")], **options)
 
     def options(self, given: str | Options | nn.Module) -> Config:
@@ -44,11 +46,11 @@ class _Backbones(Registry[Callable[..., Backbone]]):
 
     def build(  # type: ignore[override]
         self,
-        options: str | Options | nn.Module,
+        options: str | Options | nn.Module | None,
         rays: Tensor | None = None,
         *,
         shape: tuple[int, int, int] | None = None,
-        **given: Any,
+        **common: Any,
     ) -> Backbone:
         """Build a backbone by name or options, as in conf/backbone, or of a module of one's own,
         for images of some rays.
@@ -56,53 +58,18 @@ class _Backbones(Registry[Callable[..., Backbone]]):
         Args:
             rays: Elevation and azimuth in radians, (2, H, W).
             shape: Instead of rays: (C, H, W) of images of an HDL-64E.
-            given: Further options of `Backbone`, such as in_channels.
+            common: Further options of `Backbone`, such as in_channels.
         """
+        if options is None:
+            raise InputError(
+                "stage.parent names a run without a backbone: leave it out, or name a flow."
+            )
         if shape is not None:
             rays = SENSORS["hdl64e"].resized(*shape[1:]).rays()
-            given["in_channels"] = shape[0]
-        chosen = {**self.options(options), **given}
-        if chosen["name"] == OWN:
-            del chosen["name"]
-            return construct("backbone 'own'", own_backbone, chosen, rays)
-        return super().build(chosen, rays)
+            common["in_channels"] = shape[0]
+        return super().build({**self.options(options), **common}, rays)
 
 
 BACKBONES = _Backbones(
     "backbone", hdit=HDiT, adm_unet=ADMUNet, efficient_unet=EfficientUNet, vit=ViT, local=Local
 )
-
-
-def build_backbone(
-    options: Options | None,
-    rays: Tensor,
-    in_channels: int,
-    out_channels: int | None = None,
-    second_time: bool = False,
-) -> Backbone:
-    """Build the backbone `options["name"]`, as in conf/backbone.
-
-    Args:
-        rays: Elevation and azimuth of every pixel in radians, (2, H, W).
-        in_channels: Channels of the image and of a condition.
-        out_channels: None means as many.
-    """
-    if options is None:
-        raise InputError(
-            "stage.parent names a run without a backbone: leave it out, or name a flow."
-        )
-    given: Config = {
-        "in_channels": in_channels,
-        "out_channels": out_channels or in_channels,
-    }
-    if second_time:  # a plug-in may have one time only
-        given["second_time"] = True
-    return BACKBONES.build(options, rays, **given)
-
-
-def configurations() -> Registry[Config]:
-    """Options for `build_backbone`: conf/backbone/*.yaml, and the defaults of backbones without a
-    file.
-    """
-    defaults = {name: {"name": name} for name in BACKBONES}
-    return Registry("backbone configuration", **{**defaults, **presets("backbone")})

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from r2flow.backbones import build_backbone
+from r2flow.backbones import BACKBONES
 from r2flow.base.errors import InputError
 from r2flow.base.noise import Draws
 from r2flow.flow.maps import MeanVelocity
@@ -92,8 +92,14 @@ class NetworkFlow(Flow):
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space)
         channels = space.shape[0]
-        inputs = channels + self.condition_channels
-        self.backbone = build_backbone(backbone, space.rays, inputs, channels, self.second_time)
+        times = {"second_time": True} if self.second_time else {}  # a plug-in may have one only
+        self.backbone = BACKBONES.build(
+            backbone,
+            space.rays,
+            in_channels=channels + self.condition_channels,
+            out_channels=channels,
+            **times,
+        )
 
     def further_noise(self, draws: Draws, j: int) -> Tensor:
         """Noise of step j, cropped to the region."""

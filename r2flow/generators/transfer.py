@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from r2flow.backbones import build_backbone
+from r2flow.backbones import BACKBONES
 from r2flow.base.errors import InputError
 from r2flow.base.processes import mean_over_processes
 from r2flow.base.registry import NonNegative
@@ -104,7 +104,9 @@ class TransferFlow(Flow):
         inputs = space.shape[0] + FEATURES + RowFeatures.FEATURES + space.encoding.labels
         self.classes = len(COMMON) if space.encoding.labels else 0
         outputs = 3 * _CANDIDATES + 2 + self.classes
-        self.backbone = build_backbone(backbone, space.rays, inputs, outputs)
+        self.backbone = BACKBONES.build(
+            backbone, space.rays, in_channels=inputs, out_channels=outputs
+        )
         self.backbone.refuse_parametrised(type(self).__name__)
         if not self.backbone.any_size:
             raise InputError(

@@ -14,7 +14,7 @@ from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from r2flow.backbones import Backbone, build_backbone, configurations
+from r2flow.backbones import BACKBONES, Backbone
 from r2flow.base.errors import InputError
 from r2flow.base.progress import track
 from r2flow.generators import build_generator
@@ -139,12 +139,11 @@ def backbone_costs(
     The latency is None without `repeats`. A configuration that does not support the size has only
     an `error`.
     """
-    table = configurations()
-    for name in names or table:
-        options = table[name]
+    for name in names or BACKBONES:
+        backbone = BACKBONES[name]
         try:
             with torch.device("cpu" if repeats > 0 else "meta"):  # counting needs no weights
-                model = build_backbone(options, sensor.rays(), 2).eval()
+                model = backbone(sensor.rays()).eval()
         except InputError as error:
             yield {"name": name, "error": str(error)}
         else:

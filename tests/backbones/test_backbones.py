@@ -13,8 +13,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from tiny_backbones import COLUMNS, NAMES, PUBLISHED, ROWS, image, tiny, untrained
 
-from r2flow.backbones import build_backbone, configurations
+from r2flow.backbones import BACKBONES
 from r2flow.base.errors import InputError
+from r2flow.base.registry import presets
 from r2flow.lidar.sensors import SENSORS, build_sensor
 from r2flow.reports.backbones import count_macs
 from tests.conftest import tiny_options
@@ -108,7 +109,7 @@ def test_nearby_times_are_told_apart_under_autocast(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_derived_buffers_follow_loaded_rays(name):
     source, x = tiny(name), image(1)
-    loaded = build_backbone(tiny_options(name), torch.zeros(2, ROWS, COLUMNS), 2).eval()
+    loaded = BACKBONES.build(tiny_options(name), torch.zeros(2, ROWS, COLUMNS)).eval()
     loaded.load_state_dict(source.state_dict())
     with torch.no_grad():
         assert torch.equal(source(0.3, x), loaded(0.3, x))
@@ -152,9 +153,9 @@ def test_a_shape_that_is_not_whole_units_names_one_that_is(name, dimension):
     what, multiple = ("height", "width")[dimension], unit[dimension]
     message = rf"{what} {3 * multiple - 1} cannot be used by .* a multiple of {multiple}, such as {3 * multiple}\."
     with pytest.raises(InputError, match=message):
-        build_backbone(options, torch.zeros(2, *shape), 2)
+        BACKBONES.build(options, torch.zeros(2, *shape))
     shape[dimension] = 2 * multiple
-    build_backbone(options, torch.zeros(2, *shape), 2)
+    BACKBONES.build(options, torch.zeros(2, *shape))
 
 
 POSITIONS = ["fourier_features", "polar", "spherical_harmonics", "none", None]
@@ -210,18 +211,18 @@ def test_half_weights_are_near_float32(name, dtype):
 def test_configurations_are_what_hydra_composes(config):
     with initialize_config_dir(str(CONF), version_base=None):
         composed = OmegaConf.to_container(compose(f"backbone/{config}").backbone, resolve=True)
-    assert configurations()[config] == composed
+    assert presets("backbone")[config] == composed
 
 
 def test_a_backbone_without_a_file_is_configured_by_its_defaults():
-    assert configurations()["plain"] == {"name": "plain"}
+    assert BACKBONES.options("plain") == {"name": "plain"}
 
 
 @pytest.mark.parametrize("config", [path.stem for path in (CONF / "backbone").glob("*.yaml")])
 def test_every_configuration_builds_for_every_sensor(config):
     with torch.device("meta"):
         for sensor in SENSORS:
-            build_backbone(configurations()[config], build_sensor(sensor).rays(), 2)
+            BACKBONES.build(config, build_sensor(sensor).rays())
 
 
 @pytest.mark.parametrize(
@@ -243,8 +244,7 @@ def test_every_configuration_builds_for_every_sensor(config):
 def test_backbones_of_an_ablation_are_of_one_size_or_one_cost(names, count, size):
     with torch.device("meta"):
         counts = [
-            count(build_backbone(configurations()[name], build_sensor("hdl64e", *size).rays(), 2))
-            for name in names
+            count(BACKBONES.build(name, build_sensor("hdl64e", *size).rays())) for name in names
         ]
     assert max(counts) <= 1.1 * min(counts)
 
@@ -253,7 +253,7 @@ def test_backbones_of_an_ablation_are_of_one_size_or_one_cost(names, count, size
 def test_names_and_shapes_are_the_published_models(config, shared):
     expected = json.loads((shared / "oracle" / "state_dict_keys.json").read_text())[LISTED[config]]
     with torch.device("meta"):
-        model = build_backbone(configurations()[config], build_sensor("hdl64e").rays(), 2)
+        model = BACKBONES.build(config, build_sensor("hdl64e").rays())
     kinds = dict.fromkeys(dict(model.named_parameters()), "param")
     found = {
         key: (list(value.shape), kinds.get(key, "buffer"))

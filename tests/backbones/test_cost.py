@@ -5,7 +5,7 @@ import torch
 from tiny_backbones import Plain
 from torch import nn
 
-from r2flow.backbones import build_backbone, configurations
+from r2flow.backbones import BACKBONES
 from r2flow.backbones.hdit import HDiT
 from r2flow.base.errors import InputError
 from r2flow.lidar.sensors import SENSORS, build_sensor
@@ -25,7 +25,7 @@ TABLE_2 = {
 def test_the_papers_table(config):
     parameters, gmac = TABLE_2[config]
     with torch.device("meta"):
-        model = build_backbone(configurations()[config], build_sensor("hdl64e").rays(), 2)
+        model = BACKBONES.build(config, build_sensor("hdl64e").rays())
     assert count_parameters(model) == parameters
     assert count_macs(model) / 1e9 == pytest.approx(gmac, rel=2e-4)
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tiny_backbones import NAMES, PUBLISHED, rays
 
-from r2flow.backbones import BACKBONES, Backbone, build_backbone
+from r2flow.backbones import BACKBONES, Backbone
 from r2flow.base.errors import InputError
 from r2flow.lidar.region import Region
 from tests.conftest import tiny_options
@@ -18,7 +18,7 @@ CROPPABLE = [name for name, kind in BACKBONES._entries.items() if kind.croppable
 
 
 def backbone(name: str, rays: torch.Tensor = RAYS, **options) -> Backbone:
-    model = build_backbone({**tiny_options(name), **options}, rays, 2).eval().requires_grad_(False)
+    model = BACKBONES.build({**tiny_options(name), **options}, rays).eval().requires_grad_(False)
     torch.manual_seed(1)
     for parameter in model.parameters():  # nothing at zero, or there would be nothing to see
         parameter.copy_(0.3 * torch.randn_like(parameter))
@@ -84,7 +84,7 @@ def test_the_weights_are_shared(name):
 def test_units_are_patches_halved_at_every_level():
     assert backbone("hdit", patch=[2, 4]).unit == (4, 8)
     assert backbone("adm_unet").unit == backbone("efficient_unet").unit == (2, 2)
-    assert build_backbone({"name": "efficient_unet"}, RAYS, 2).unit == (8, 8)
+    assert BACKBONES.build({"name": "efficient_unet"}, RAYS).unit == (8, 8)
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name not in CROPPABLE])

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from r2flow.backbones import build_backbone
+from r2flow.backbones import BACKBONES
 from r2flow.backbones.convolutions import Resample
 from r2flow.base.errors import InputError
 from tests.reference import load_case
@@ -67,7 +67,7 @@ def test_resampling_keeps_a_constant_ring_constant(window):
 )
 def test_options_that_cannot_work_say_why(name, options, message):
     with pytest.raises(InputError, match=message), torch.device("meta"):
-        build_backbone({"name": name, **options}, torch.zeros(2, 16, 64), 2)
+        BACKBONES.build({"name": name, **options}, torch.zeros(2, 16, 64))
 
 
 @pytest.mark.parametrize(("name", "width"), [("adm_unet", 16), ("efficient_unet", 8)])
@@ -78,4 +78,4 @@ def test_the_first_convolution_has_its_published_width(name, width):
         "channel_multiplier": [2, 2],
         "num_residual_blocks": 1,
     }
-    assert len(build_backbone(options, torch.zeros(2, 16, 64), 2).in_conv.weight) == width
+    assert len(BACKBONES.build(options, torch.zeros(2, 16, 64)).in_conv.weight) == width

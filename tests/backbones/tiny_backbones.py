@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from r2flow.backbones import BACKBONES, Backbone, build_backbone
+from r2flow.backbones import BACKBONES, Backbone
 from r2flow.backbones.layers import ExactLinear
 from r2flow.lidar.sensors import build_sensor
 from tests.conftest import tiny_options
@@ -28,9 +28,9 @@ def untrained(
     second_time: bool = False,
     **options: Any,
 ) -> Backbone:
-    return build_backbone(
-        {**tiny_options(name), **options}, rays(), in_channels, out_channels, second_time
-    )
+    times = {"second_time": True} if second_time else {}
+    common = {"in_channels": in_channels, "out_channels": out_channels, **times}
+    return BACKBONES.build({**tiny_options(name), **options}, rays(), **common)
 
 
 def tiny(name: str, *channels: int | None, **options: Any) -> Backbone:
