@@ -149,6 +149,8 @@ class Generator(nn.Module):
             raise InputError(
                 f"this {type(self).__name__} takes no condition; complete scans by --sampler mmps."
             )
+        if draws is None and how.draws:
+            raise InputError(f"sampler {how.name} is stochastic: give draws.")
         dtype = next(self.parameters(), noise).dtype  # float64 for weights of 64-true runs
         if hasattr(self, "velocity"):  # a solver's state may have more digits than its network
             dtype = torch.promote_types(noise.dtype, dtype)
@@ -157,8 +159,7 @@ class Generator(nn.Module):
             condition = {name: value.to(self.device) for name, value in condition.items()}
 
         def noise_of_step(j: int) -> Tensor:
-            if draws is None:
-                raise InputError(f"sampler {how.name} is stochastic: give draws.")
+            assert draws is not None  # refused above, unless a GAN draws a mask
             return self.further_noise(draws, j).to(x)
 
         with autocast(self.device, precision):

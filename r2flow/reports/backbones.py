@@ -121,7 +121,7 @@ def report_backbones(
     sensor: Sensor, names: Sequence[str] | None = None, repeats: int = 3, device: str = "cpu"
 ) -> Page:
     """The page of `backbone_costs`."""
-    names = names or list(configurations())
+    names = names or list(BACKBONES)
     costs = backbone_costs(sensor, names, repeats, device)
     rows = list(track(costs, "measuring", "backbones", total=len(names)))
     size = " x ".join(map(str, sensor.shape))

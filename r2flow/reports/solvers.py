@@ -28,7 +28,7 @@ from r2flow.flow.solvers import (
     Velocity,
     method_of,
     solve,
-    usual_grid,
+    default_grid,
 )
 from r2flow.generators import as_flow
 from r2flow.generators.base import Progress
@@ -126,7 +126,7 @@ def configurations(
         for steps in sorted({(budget - start) // per_step for budget in budgets}):
             if steps > 0:
                 label = f"{method}, {steps} step{'s' if steps > 1 else ''}"
-                found[label] = {"method": method, "steps": steps, "grid": usual_grid(method)}
+                found[label] = {"method": method, "steps": steps, "grid": default_grid(method)}
     return found
 
 

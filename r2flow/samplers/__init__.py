@@ -14,7 +14,7 @@ from typing import Any
 
 from r2flow.base.errors import InputError
 from r2flow.base.registry import Config, Options, Registry, lazy
-from r2flow.flow.solvers import SOLVERS, usual_grid
+from r2flow.flow.solvers import SOLVERS, default_grid
 from r2flow.samplers.base import Condition, Generated, Noise, OnGrid, Progress, Sampler, _plain
 from r2flow.samplers.maps import Jump, Refine, Renoise, Transport
 from r2flow.samplers.ode import Adaptive, FixedSteps, ODESampler, TorchDiffEq
@@ -37,7 +37,7 @@ class _Samplers(Registry[Any]):
             return super().__getitem__(name)
         if SOLVERS[name].adapts:
             return partial(Adaptive, method=name)
-        return partial(FixedSteps, method=name, grid=usual_grid(name))
+        return partial(FixedSteps, method=name, grid=default_grid(name))
 
     def __contains__(self, name: object) -> bool:
         return name in SOLVERS or super().__contains__(name)

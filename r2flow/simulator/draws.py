@@ -17,6 +17,7 @@ from numpy.random import Generator
 
 # of a table of quantiles; the outermost Gaussian quantiles are at 3.8 standard deviations
 _ENTRIES = 8192
+_SHARES = ((np.arange(_ENTRIES) + 0.5) / _ENTRIES).tolist()
 # Coefficients of sin(2 pi t) / t in powers of t^2, the highest first.
 _TAYLOR = np.array(
     [(-1) ** k * math.tau ** (2 * k + 1) / math.factorial(2 * k + 1) for k in reversed(range(7))]
@@ -54,25 +55,27 @@ def scramble(a: ndarray, b: ndarray, c: ndarray, seed: int = 0) -> ndarray:
 
 @cache
 def _normal_quantiles() -> ndarray:
-    return np.array(
-        [NormalDist().inv_cdf((k + 0.5) / _ENTRIES) for k in range(_ENTRIES)], np.float32
-    )
+    return np.array([NormalDist().inv_cdf(share) for share in _SHARES], np.float32)
 
 
 @cache
 def exponential_quantiles() -> ndarray:
     """Quantiles of Exp(1) at the midpoints of 8192 equal shares, (8192,), float32."""
-    return np.array([-math.log1p(-(k + 0.5) / _ENTRIES) for k in range(_ENTRIES)], np.float32)
+    return np.array([-math.log1p(-share) for share in _SHARES], np.float32)
+
+
+def _entries(table: ndarray, rng: Generator, shape: tuple[int, ...]) -> ndarray:
+    return table[rng.integers(0, _ENTRIES, shape, dtype=np.uint16)]
 
 
 def normals(rng: Generator, shape: tuple[int, ...]) -> ndarray:
     """Standard normal draws, float32: random entries of a table of 8192 quantiles."""
-    return _normal_quantiles()[rng.integers(0, _ENTRIES, shape, dtype=np.uint16)]
+    return _entries(_normal_quantiles(), rng, shape)
 
 
 def exponentials(rng: Generator, shape: tuple[int, ...]) -> ndarray:
     """Draws from Exp(1), float32: random entries of a table of 8192 quantiles."""
-    return exponential_quantiles()[rng.integers(0, _ENTRIES, shape, dtype=np.uint16)]
+    return _entries(exponential_quantiles(), rng, shape)
 
 
 def logistic(x: ndarray) -> ndarray:
@@ -132,7 +135,7 @@ class ScalarDraws:
 
     def side(self) -> int:
         """+1 (left) or -1 (right)."""
-        return 1 if self.unit() < 0.5 else -1
+        return 1 if self.chance(0.5) else -1
 
     def pick(self, options: Sequence[_T], shares: Sequence[float]) -> _T:
         """Choose an option with probability proportional to `shares`."""

@@ -15,7 +15,7 @@ _BONNET = 0.70
 class ObjectBuilder(SceneBuilder):
     """Draws the objects of a street; those that need ground are left out where it is taken."""
 
-    def car(self, pose: Pose, moving: bool = False) -> None:
+    def car(self, pose: Pose, label: str = "car") -> None:
         """A body with plates, a bonnet up to the windscreen, a cabin with panes, four wheels."""
         forms = TABLES["cars"].values()
         form = self.pick([*forms], [share for share, *_ in forms])
@@ -25,7 +25,6 @@ class ObjectBuilder(SceneBuilder):
         site = self.take(pose, length, width)
         if not site:
             return
-        label = "moving-car" if moving else "car"
         if self.chance(0.45):
             paint = label, "dark paint", self.albedo("dark paint")
         else:
@@ -43,7 +42,7 @@ class ObjectBuilder(SceneBuilder):
         for x in (-0.3 * length, 0.3 * length):
             _axle(site, label, x, width / 2 - 0.10, 0.60, 0.22, 0.62)
 
-    def truck(self, pose: Pose, moving: bool = False) -> None:
+    def truck(self, pose: Pose, label: str = "truck") -> None:
         """A delivery van or lorry: cab in front of a box on wheels."""
         length = self.uniform(5.5, 9.5)
         width = self.uniform(2.0, 2.5)
@@ -51,7 +50,6 @@ class ObjectBuilder(SceneBuilder):
         site = self.take(pose, length, width)
         if not site:
             return
-        label = "moving-truck" if moving else "truck"
         cab = 1.9  # metres, its length
         paint = label, "paint", self.uniform(0.2, 0.7)
         size = cab, width - 0.1, 0.45, 2.3
@@ -80,13 +78,12 @@ class ObjectBuilder(SceneBuilder):
             site.blob(0.1, 0, 1.68, 0.11, 0.13, 0, label, "skin")
             site.cylinder(0, 0, 0.12, 0.4, 1.0, label, "cloth")
 
-    def person(self, pose: Pose, moving: bool) -> None:
+    def person(self, pose: Pose, label: str) -> None:
         """Two legs, a trunk, arms and a head."""
         site = self.take(pose, 0.5)
         if not site:
             return
         tall = self.uniform(1.55, 1.9)
-        label = "moving-person" if moving else "person"
         cloth = label, "cloth", self.albedo("cloth")
         stride = self.uniform(0.05, 0.25)
         for side in (-1, 1):

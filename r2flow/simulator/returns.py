@@ -82,8 +82,8 @@ def report(
         row = rows_of(sensor, slope + rise / np.maximum(s, 0.1))
     kept = np.flatnonzero(seen & (row >= 0))[::-1]  # of equal ranges, the last
     values = np.stack([r, reading, hits.label]).reshape(3, -1)[:, kept]  # ids are exact in float32
-    pixel, chosen = nearest((row * w + columns).ravel()[kept], values[0], math.prod(sensor.shape))
-    *image, labels = scatter(sensor, pixel, [*values[:, chosen]])
+    pixel, near = nearest((row * w + columns).ravel()[kept], values[0], math.prod(sensor.shape))
+    *image, labels = scatter(sensor, pixel, [*values[:, near]])
     return np.stack(image), labels.astype(np.uint16)
 
 

@@ -261,9 +261,9 @@ class StreetBuilder(ObjectBuilder):
             if main.start < u < main.stop:
                 pose = main.lane(u, lane * main.half_width / 2)
                 if self.chance(0.1):
-                    self.truck(pose, moving=True)
+                    self.truck(pose, "moving-truck")
                 else:
-                    self.car(pose, moving=True)
+                    self.car(pose, "moving-car")
 
     def _walk(self, main: Street) -> None:
         """People on the pavements, cyclists on the carriageway."""
@@ -272,7 +272,7 @@ class StreetBuilder(ObjectBuilder):
             pose = main.place(self.uniform(-35, 35), lateral)
             if pose.away > _CLEAR:
                 pose = pose.turned(pi if self.chance(0.5) else 0.0)
-                self.person(pose, moving=self.chance(0.7))
+                self.person(pose, "moving-person" if self.chance(0.7) else "person")
         for _ in range(self.poisson(0.25 * self.kind.people)):
             lateral = self.side() * (main.half_width - 0.7)
             self.cyclist(main.lane(self.uniform(6, 40) * self.side(), lateral))

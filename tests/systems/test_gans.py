@@ -33,6 +33,7 @@ from r2flow.systems.gan.augment import (
 from r2flow.systems.gan.dcgan import DustyV1, VanillaGan
 from r2flow.systems.gan.layers import _straight_through_mask, logistic
 from r2flow.systems.gan.stage import (
+    LearnGan,
     Warmup,
     _blurred,
     _discriminator_loss,
@@ -407,6 +408,41 @@ def test_each_row_of_the_log_has_the_augmentation_of_its_step_and_the_last_penal
     assert fit(
         build(compose([*options, f"stage.parent={tmp_path}", f"run_dir={tmp_path / 'tuned'}"]))
     ).finished
+
+
+def test_a_training_step_has_the_losses_of_the_scores_that_it_sees(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    stage: Any = LearnGan(
+        generator=build_generator(tiny("dusty1")), discriminator={"name": "dcgan", "base_channels": 4, "halvings": 2},
+        augment=None, warmup={"images": 0}, r1=0.5, r1_every=1,
+    )  # fmt: skip
+    seen: list[tuple[torch.Tensor, torch.Tensor]] = []
+    stage.discriminator.register_forward_hook(lambda _, x, y: seen.append((x[0], y.detach())))
+    losses = {}
+    stage.own_optimizers = lambda: ("generator", "discriminator")
+    stage.take_step = lambda name, loss: losses.setdefault(name, []).append(loss.item())
+    stage.log = lambda *_, **__: None
+    monkeypatch.setattr(LearnGan, "images_per_step", 4)
+    real = torch.rand(4, *stage.space.shape)
+    stage.training_step({"x_1": real, "x_0": torch.randn(4, 8), "k": torch.arange(4)}, 0)
+    (shown, fooled), (scan, right), (fake, wrong), (penalised, _) = seen
+    assert torch.equal(scan, real)
+    assert torch.equal(penalised.detach(), real)
+    assert shown.shape == fake.shape == real.shape
+    assert not torch.equal(shown, fake)
+    # of `gan_losses.pt`, whose forms they are by another test
+    x = real.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(stage.discriminator(x).sum(), x)
+    assert losses == {
+        "generator": pytest.approx([_generator_loss(fooled).item()]),
+        "discriminator": pytest.approx(
+            [
+                _discriminator_loss(right, wrong).item(),
+                0.5 * 1 / 2 * slope.square().sum((1, 2, 3)).mean().item(),
+            ]
+        ),
+    }
 
 
 @pytest.mark.slow

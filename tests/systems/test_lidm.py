@@ -13,7 +13,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 import yaml
-from torch import Tensor
+from torch import Tensor, nn
 
 from r2flow.base.errors import InputError
 from r2flow.base.noise import Draws
@@ -34,10 +34,9 @@ from r2flow.systems.latent.generator import _some_of
 from r2flow.systems.latent.published import _autoencoder, _unet, _within
 from r2flow.systems.latent.quantiser import Quantiser
 from r2flow.systems.latent.stage import (
-    _adaptive_weight,
+    LearnAutoencoder,
+    LearnLatentDiffusion,
     _adversarial_factor,
-    _hinge_loss,
-    _PatchDiscriminator,
     _reconstruction_loss,
     returns,
 )
@@ -179,8 +178,14 @@ def test_objective_and_gradients_are_the_published(diffusion: dict[str, Any]):
     assert_near(z, case["x_t"], 1e-5)
     loss = (unet(z, case["t"]) - case["noise"]).square().flatten(1).mean(1)
     assert_near(loss, case["per_sample"], 1e-5)
-    assert_near(loss.mean(), case["loss"], 1e-5)
-    loss.mean().backward()
+    # by the stage, at the steps of uniform draws, of scans that the autoencoder makes x_start
+    stage = LearnLatentDiffusion(generator=build_generator(DIFFUSION))
+    stage.generator.model["diffusion_model"] = unet
+    stage.generator.first_stage_model.encode = lambda x: case["x_start"]
+    batch = {"x_1": torch.zeros(3, 1, 8, 32), "x_0": case["noise"]}
+    loss = stage.regression_loss(batch, (case["t"] + 0.5) / 1000)
+    assert_near(loss, case["loss"], 1e-5)
+    loss.backward()
     assert_norms(unet, case["grad_param_norms"], prefix="diffusion_model.")
 
 
@@ -217,37 +222,47 @@ def test_subsets_of_steps_are_the_published(diffusion: dict[str, Any], name: str
 
 
 @pytest.mark.parametrize("step", [0, 1, 2])
-def test_adversarial_losses_and_gradients_are_the_published(shared: Path, step: int):
+def test_a_training_step_has_the_published_losses_and_gradients(
+    shared: Path, monkeypatch: pytest.MonkeyPatch, step: int
+):
+    """Of the stage, with the case's autoencoder: a convolution of features by its last weights."""
     case = load_case(shared, "lidm_ae_loss.pt")
     cfg = case["cfg"]
-    model = _PatchDiscriminator(cfg["disc_in_channels"], cfg["disc_ndf"], cfg["disc_num_layers"])
-    model.load_state_dict(case["discriminator"])
-    last, factor = (
-        case["last_layer"].clone().requires_grad_(),
-        _adversarial_factor(step, cfg["disc_start"], True),
+    stage: Any = LearnAutoencoder(
+        generator=build_generator(AUTOENCODER),
+        discriminator={"width": cfg["disc_ndf"], "layers": cfg["disc_num_layers"]},
+        adversarial_weight=cfg["disc_weight"],
+        adversarial_start=cfg["disc_start"],
+        codebook_weight=cfg["codebook_weight"],
+        inverted=True,
     )
-    made = F.conv2d(case["features"], last)
-    expected = case["cases"][f"step{step}_ae"]
-    reconstruction, adversarial = _reconstruction_loss(case["inputs"], made), -model(made).mean()
-    weight = _adaptive_weight(reconstruction, adversarial, last, cfg["disc_weight"])
-    assert_near(weight, expected["log"]["train/d_weight"], 1e-4)
-    assert_near(adversarial, expected["log"]["train/g_loss"], 1e-4)
-    loss = (
-        reconstruction
-        + factor * weight * adversarial
-        + cfg["codebook_weight"] * case["codebook_loss"]
-    )
-    assert_near(loss, expected["loss"], 1e-4)
-    loss.backward()
-    assert_near(last.grad, expected["grad_last_layer"], 1e-3)
-    assert_norms(model, expected["grad_disc_norms"])
+    last = nn.Parameter(case["last_layer"].clone())
+    stage.autoencoder = nn.Module()
+    stage.autoencoder.mask = False
+    stage.autoencoder.decoder = nn.ModuleDict({"conv_out": nn.Module()})
+    stage.autoencoder.decoder["conv_out"].weight = last
+    stage.autoencoder.forward = lambda x: (F.conv2d(case["features"], last), case["codebook_loss"])
+    model = stage.discriminator
+    losses = []
+
+    def take_step(name: str, loss: Tensor) -> None:
+        stage.zero_grad()
+        expected = case["cases"][f"step{step}_{name}"]
+        losses.append(loss.item())
+        assert losses[-1] == pytest.approx(expected["loss"], rel=1e-4)
+        loss.backward()
+        assert_norms(model, expected["grad_disc_norms"])
+        if name == "ae":
+            assert_near(last.grad, expected["grad_last_layer"], 1e-3)
+
     model.load_state_dict(case["discriminator"])
-    model.zero_grad()
-    expected = case["cases"][f"step{step}_disc"]
-    loss = factor * _hinge_loss(model(case["inputs"]), model(made.detach()))
-    assert loss.item() == pytest.approx(expected["loss"], rel=1e-4)
-    loss.backward()
-    assert_norms(model, expected["grad_disc_norms"])
+    monkeypatch.setattr(LearnAutoencoder, "global_step", step)
+    stage.own_optimizers = lambda: ("ae", "disc")
+    stage.take_step = take_step
+    stage.log = lambda name, value, **_: losses.append(torch.as_tensor(value).item())
+    stage.training_step({"x_1": case["inputs"]}, 0)
+    log = case["cases"][f"step{step}_ae"]["log"]
+    assert losses[2:4] == pytest.approx([log["train/rec_loss"], log["train/quant_loss"]], rel=1e-5)
 
 
 def test_the_discriminator_begins_at_its_step_and_ends_there_as_published():

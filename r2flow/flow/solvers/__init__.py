@@ -35,8 +35,17 @@ from r2flow.flow.solvers.solution import (
 )
 
 __all__ = [
-    "LEAST_TOLERANCE", "SOLVERS", "TORCHDIFFEQ", "EmbeddedMethod", "FixedStep", "Solution",
-    "Velocity", "method_of", "named_grid", "solve", "usual_grid",
+    "LEAST_TOLERANCE",
+    "SOLVERS",
+    "TORCHDIFFEQ",
+    "EmbeddedMethod",
+    "FixedStep",
+    "Solution",
+    "Velocity",
+    "default_grid",
+    "method_of",
+    "named_grid",
+    "solve",
 ]  # fmt: skip
 
 SOLVERS: Registry[FixedStep | EmbeddedMethod | ExponentialMethod] = Registry(
@@ -124,6 +133,6 @@ def method_of(name: str) -> FixedStep | EmbeddedMethod | ExponentialMethod | Tor
     return SOLVERS[name]
 
 
-def usual_grid(name: str) -> str:
+def default_grid(name: str) -> str:
     """The default grid of a method: denser towards t = 1 for multistep methods, else uniform."""
     return "power:1.75" if getattr(SOLVERS[name], "multistep", False) else "uniform"

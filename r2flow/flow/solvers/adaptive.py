@@ -91,5 +91,5 @@ def _step(
     good = inspect(control, Tried(method, x, k, h, scale), good)
     control.note_poles(good, speed, size, together < apart)
     control.judge(good, error, dk, dy)
-    chosen = expand_time(torch.from_numpy(good).to(x.device), x)
-    return torch.where(chosen, y, x), torch.where(chosen, last, k_1)
+    accepted = expand_time(torch.from_numpy(good).to(x.device), x)
+    return torch.where(accepted, y, x), torch.where(accepted, last, k_1)

@@ -87,8 +87,8 @@ def inspect(control: StepController, tried: Tried, good: ndarray) -> ndarray:
     planned = {}
     for place in good.nonzero()[0].tolist():
         once = [0.5 + _OFF_CENTRE] if compared[place] else []
-        usual = _probes(method, control.h[place] / control.length) or once
-        planned[place] = usual + control.remembered(place)
+        even = _probes(method, control.h[place] / control.length) or once
+        planned[place] = even + control.remembered(place)
     held = good.copy()
     found: dict[int, dict[float, Tensor]] = {}  # v at the probe that shows a change, by its time
     for turn in count():

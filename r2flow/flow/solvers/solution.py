@@ -77,7 +77,7 @@ class Evaluations:
         self.counts, self.accepted, self.rejected = np.zeros((3, scenes), dtype=np.int64)
         self.stiff, self.converged = np.zeros((2, scenes), dtype=bool)
         self.scenes = np.arange(scenes)
-        self._own_types = _own_types(velocity)
+        self._types = _types_of(velocity)
         self.precision = torch.float64
 
     def __call__(self, t: Tensor, x: Tensor) -> Tensor:
@@ -105,7 +105,7 @@ class Evaluations:
 
     def coarsest(self, *tensors: Tensor) -> torch.dtype:
         """The type of fewest digits among those of tensors, autocast and velocity."""
-        types = [x.dtype for x in tensors] + self._own_types
+        types = [x.dtype for x in tensors] + self._types
         kind = tensors[0].device.type
         if torch.is_autocast_enabled(kind):
             types.append(torch.get_autocast_dtype(kind))
@@ -126,7 +126,7 @@ def selected(velocity: Any, scenes: Tensor) -> Any:
     return velocity.select(scenes) if hasattr(velocity, "select") else velocity
 
 
-def _own_types(velocity: Velocity) -> list[torch.dtype]:
+def _types_of(velocity: Velocity) -> list[torch.dtype]:
     """Types of a module's parameters, and the attribute `precision`."""
     module = getattr(velocity, "__self__", velocity)
     parameters = module.parameters() if isinstance(module, torch.nn.Module) else ()

@@ -16,7 +16,7 @@ _PREDICTIONS = {"eps": "eps", "v": "v", "x_0": "x"}
 _NETWORK = "model."  # prefix of the network's weights in the file; other entries are empty
 
 
-def read(content: Any, path: Path, averaged: bool = True) -> Published:
+def _read_r2dm(content: Any, path: Path, averaged: bool = True) -> Published:
     """Load a published diffusion, sampled by 256 ancestral steps as in its scripts."""
     config = published_config(content["cfg"])
     weights = {}
@@ -49,4 +49,4 @@ def published_config(cfg: Options) -> Config:
     return {**config, "published": dict(cfg)}
 
 
-FORMAT = Format("R2DM", has_keys("cfg", "weights", "ema_weights"), read)
+FORMAT = Format("R2DM", has_keys("cfg", "weights", "ema_weights"), _read_r2dm)

@@ -22,7 +22,7 @@ _FORM = {
 }
 
 
-def read(content: Any, path: Path, averaged: bool = True) -> Published:
+def _read_gan(content: Any, path: Path, averaged: bool = True) -> Published:
     """Read the generator of a published GAN, with averaged or raw weights."""
     cfg = content["cfg"]
     angle = content["angle"]
@@ -78,4 +78,4 @@ def _generator(model: Options) -> Config:
     return options
 
 
-FORMAT = Format("DUSty", has_keys("cfg", "angle", "G", "G_ema", "D"), read)
+FORMAT = Format("DUSty", has_keys("cfg", "angle", "G", "G_ema", "D"), _read_gan)

@@ -13,13 +13,13 @@ from r2flow.model.published import Format, Published
 _FIRST = "module.begin_conv.weight"  # with the prefix of torch's DataParallel
 
 
-def holds(content: Any) -> bool:
+def _holds_score_model(content: Any) -> bool:
     if not isinstance(content, list) or len(content) not in (4, 5):
         return False
     return isinstance(content[0], Mapping) and _FIRST in content[0]
 
 
-def read(content: Any, path: Path, averaged: bool = True) -> Published:
+def _read_score_model(content: Any, path: Path, averaged: bool = True) -> Published:
     """Load a published score model.
 
     Averaged weights lack buffers, and files without averages have raw weights.
@@ -59,4 +59,4 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     return Published(config, weights, int(content[3]), {"name": "langevin", "steps": 5})
 
 
-FORMAT = Format("LiDARGen", holds, read)
+FORMAT = Format("LiDARGen", _holds_score_model, _read_score_model)
