@@ -26,9 +26,9 @@ from r2flow.flow.solvers import (
     TORCHDIFFEQ,
     Solution,
     Velocity,
+    default_grid,
     method_of,
     solve,
-    default_grid,
 )
 from r2flow.generators import as_flow
 from r2flow.generators.base import Progress
