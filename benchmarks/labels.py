@@ -31,7 +31,7 @@ from torch import Tensor, nn
 
 from r2flow.backbones import BACKBONES
 from r2flow.data.reading import Reading, read_image
-from r2flow.data.sources import SimulatedScans
+from r2flow.data.simulated import SimulatedScans
 from r2flow.lidar.labels import COMMON
 from r2flow.lidar.projection import image_points
 from r2flow.lidar.scan_files import pandaset, write_points

@@ -66,8 +66,8 @@ class Store:
         self.digest = checksum(self.described)
         self._held: int | None = None  # descriptor of the claimed folder
 
-    def files(self, item: int) -> list[Path]:
-        return [self.folder / f"{self.kind}-{item:06d}.safetensors"]
+    def file(self, item: int) -> Path:
+        return self.folder / f"{self.kind}-{item:06d}.safetensors"
 
     def check(self, claimed: bool = False) -> bool:
         """Whether the folder has a manifest; refuses a folder with scans, or with anything of
@@ -138,7 +138,7 @@ class Store:
             "sha256": state_hash(tensors, notes or {}),
             "notes": notes or {},
         }
-        (path,) = self.files(item)
+        path = self.file(item)
         if path.is_symlink() and not path.exists():
             path.unlink()
         stored = {name: np.asarray(value, order="C") for name, value in tensors.items()}
@@ -162,7 +162,7 @@ class Store:
 
     @contextmanager
     def _opened(self, item: int) -> Iterator[tuple[Any, Config]]:
-        (path,) = self.files(item)
+        path = self.file(item)
         if not path.is_file():
             raise FileNotFoundError(path)
         try:
@@ -189,7 +189,7 @@ class Store:
         except FileNotFoundError:
             pass
         except Damaged as error:
-            (path,) = self.files(item)
+            path = self.file(item)
             log.warning("%s is damaged (%s): it is made again.", path, error)
             path.unlink(missing_ok=True)
 
@@ -225,9 +225,7 @@ class Store:
                 time.sleep(_PATIENCE)
             if waiting and time.monotonic() - since > QUIET:
                 since = math.inf  # log once
-                log.warning(
-                    "waiting for another process, which makes %s", self.files(waiting[0])[0]
-                )
+                log.warning("waiting for another process, which makes %s", self.file(waiting[0]))
             left = waiting
 
     def attempt(self, item: int, work: Callable[[int], None]) -> bool:
@@ -241,14 +239,14 @@ class Store:
         lock = FileLock(path, timeout=0)
         try:
             lock.acquire()
-            if not self.has(item):
-                work(item)
         except Timeout:
             return False
+        try:
+            if not self.has(item):
+                work(item)
         finally:
-            if lock.is_locked:
-                path.unlink(missing_ok=True)
-                lock.release()
+            path.unlink(missing_ok=True)
+            lock.release()
         return True
 
 
@@ -262,6 +260,9 @@ class FileStore(Store):
     ) -> None:
         super().__init__(folder, kind, recipe)
         self.endings = endings
+
+    def file(self, item: int) -> Path:
+        return self.files(item)[0]
 
     def files(self, item: int) -> list[Path]:
         return [self.folder / f"{item:06d}.{ending}" for ending in self.endings]

@@ -34,7 +34,7 @@ def test_of_two_recipes_in_one_empty_folder_the_first_alone_writes(tmp_path: Pat
     first.begin()
     with pytest.raises(InputError, match="holds other samples: seed"):
         second.begin()
-    write_file(first.files(0)[0], b"one")
+    write_file(first.file(0), b"one")
     with pytest.raises(InputError, match="holds other samples"):
         second.begin()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["000000.bin", "manifest.json"]

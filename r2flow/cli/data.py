@@ -90,7 +90,7 @@ def prepare(
         raise InputError(f"{scans} is one scan; give the folder of a data set.")
     store = preparing.plan(out, described, reading.reading([described]), shard_scans)
     left_out, made = preparing.prepare(store, on_bad_scan, workers or cores())
-    size = sum(store.files(shard)[0].stat().st_size for shard in store.shards)
+    size = sum(store.file(shard).stat().st_size for shard in store.shards)
     there = len(store.shards) - len(made)
     levels = store.described["levels"]
     notes = [

@@ -98,6 +98,6 @@ def pairs(
             "pairs"
         )
         return
-    size = sum(store.files(shard)[0].stat().st_size for shard in store.shards)
+    size = sum(store.file(shard).stat().st_size for shard in store.shards)
     shards = several(len(store.shards), "shard")
     print(f"{folder}: all {num} pairs, {shards}, {size / 2**20:.0f} MiB")

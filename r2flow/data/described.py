@@ -162,39 +162,40 @@ def describe(spec: Spec, **options: Any) -> Described:
         return spec
     text = str(spec)
     path = Path(text).expanduser()
-    kind, colon, rest = text.partition(":")
-    of_seed = bool(colon) and kind == SIMULATED
-    if options.get("split") and (of_seed or path.is_file()):
+    kind, colon, root = text.partition(":")
+    simulated = bool(colon) and kind == SIMULATED
+    if options.get("split") and (simulated or path.is_file()):
         raise InputError(f"{text} has no split: leave {options['split']!r} out.")
-    if of_seed:
-        if not rest.isdecimal():
+    if simulated:
+        if not root.isdecimal():
             raise InputError(
                 f"simulated scans are named by their seed, as simulated:0; found {text!r}."
             )
         scenes = {"scenes": SCENES, **options}
-        return Described(text, SourceOptions(kind, **scenes), seed=int(rest))
+        return Described(text, SourceOptions(kind, **scenes), seed=int(root))
     if colon and kind in SOURCES:
-        return Described(text, SourceOptions(kind, rest, **options))
-    if colon and not path.exists() and "/" not in kind and "\\" not in kind:
-        SOURCES[kind]  # not known
+        return Described(text, SourceOptions(kind, root, **options))
     if path.is_file():
         return Described(text, SourceOptions(FOLDER, str(path.parent)), path)
     if not path.exists():
         raise _not_found(text, path)
-    folder = Described(text, SourceOptions(FOLDER, str(path), **options))
-    if folder.manifest.get("format") == "r2flow scans":
-        folder.options = replace(folder.options, name=PREPARED)
-    elif (path / "config.yaml").is_file() or (path / "checkpoints").is_dir():
-        samples = path / "samples"
-        if not samples.is_dir():
+    if (path / "config.yaml").is_file() or (path / "checkpoints").is_dir():  # of a run
+        run = path
+        path = run / "samples"
+        if not path.is_dir():
             raise InputError(
-                f"{path} is a run without samples; draw some: r2flow sample {path} --out {samples}."
+                f"{run} is a run without samples; draw some: r2flow sample {run} --out {path}."
             )
-        return Described(text, SourceOptions(FOLDER, str(samples), **options))
-    return folder
+    scans = Described(text, SourceOptions(FOLDER, str(path), **options))
+    if scans.manifest.get("format") == "r2flow scans":
+        scans.options = replace(scans.options, name=PREPARED)
+    return scans
 
 
 def _not_found(text: str, path: Path) -> InputError:
+    kind, colon, _ = text.partition(":")
+    if colon and "/" not in kind and "\\" not in kind:
+        SOURCES[kind]  # not known
     if text in MODELS:
         return InputError(f"{text} is a model; sample it first: r2flow sample {text} --out scans.")
     if path.is_symlink():

@@ -14,13 +14,15 @@ from typing import TYPE_CHECKING
 from r2flow.base.errors import InputError
 from r2flow.base.registry import Registry
 from r2flow.data import layouts
+from r2flow.data.files import ScanFiles
 from r2flow.data.layouts import Drive
 from r2flow.data.options import FOLDER, ReadingOptions, SourceOptions
 from r2flow.data.prepared import PreparedScans, PreparedStore, refuse_other_images, stored_scans
 from r2flow.data.reading import Reading, labelled, leaving_out
 from r2flow.data.reflectance import lacks_reflectance
 from r2flow.data.sensor_checks import warn_of_other_sensor
-from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans
+from r2flow.data.simulated import SimulatedScans
+from r2flow.data.sources import ScanSource
 
 if TYPE_CHECKING:
     from r2flow.data.described import Described

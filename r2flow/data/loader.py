@@ -186,13 +186,12 @@ class Mixture(ScanSource):
 
     def subset(self, indices: Sequence[int]) -> "Mixture":
         """Some of the scans, by ascending numbers, as a mixture of the same parts."""
-        chosen: list[list[int]] = [[] for _ in self.parts]
+        of_parts: list[list[int]] = [[] for _ in self.parts]
         for index in indices:
             part, number = self.locate(index)
-            chosen[part].append(number)
-        return Mixture(
-            [part.subset(numbers) for part, numbers in zip(self.parts, chosen, strict=True)]
-        )
+            of_parts[part].append(number)
+        subsets = zip(self.parts, of_parts, strict=True)
+        return Mixture([part.subset(numbers) for part, numbers in subsets])
 
 
 class MixedOrder:

@@ -14,11 +14,11 @@ from torch import Tensor
 from r2flow.base.errors import InputError
 from r2flow.data.described import Described, Spec, describe
 from r2flow.data.detection import reading_for
+from r2flow.data.files import ScanFiles
 from r2flow.data.options import SIMULATED
 from r2flow.data.reading import AUTO, Reading
 from r2flow.data.reflectance import lacks_reflectance
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import ScanFiles
 from r2flow.lidar.scan_files import read_range_image
 from r2flow.lidar.sensors import Sensor
 
@@ -56,11 +56,12 @@ def open_each(scans: Described, paths: Sequence[str], reading: Reading) -> Itera
         sensor = reading.sensor
         if image is not None:
             sensor = sensor.resized(*image.shape[1:])
-        own = replace(reading, sensor=sensor)
-        if reading.reflectance == AUTO:
+        reflectance = reading.reflectance
+        if reflectance == AUTO:
             lacking = lacks_reflectance([path], reading.on_bad_scan, reading.columns)
-            own = replace(own, reflectance=lacking is None)
-        yield ScanSet(scans.label, ScanFiles([path], own, scans.options.folder), sensor)
+            reflectance = lacking is None
+        how = replace(reading, sensor=sensor, reflectance=reflectance)
+        yield ScanSet(scans.label, ScanFiles([path], how, scans.options.folder), sensor)
 
 
 def read(

@@ -24,7 +24,7 @@ from r2flow.data.options import PairOptions
 from r2flow.generators import Flow, Generator, as_flow
 from r2flow.model.shipped import name_of
 from r2flow.samplers import build_sampler
-from r2flow.store import Damaged, Store
+from r2flow.store import Store
 
 
 class PairStore(Store):
@@ -68,22 +68,19 @@ class PairStore(Store):
         }
         super().__init__(folder, "pairs", recipe)
         self.check()
-        self.shards = range(-(-options.num // (self.shard_batches * options.batch_size)))
+        self.shards = range(math.ceil(options.num / (self.shard_batches * options.batch_size)))
 
     def batches_of(self, shard: int) -> range:
         """The batches of a shard that the first `num` pairs need."""
-        needed = range(-(-self.options.num // self.options.batch_size))
+        needed = range(math.ceil(self.options.num / self.options.batch_size))
         return needed[shard * self.shard_batches : (shard + 1) * self.shard_batches]
-
-    def has(self, item: int) -> bool:
-        """Whether a shard exists and has all batches that the first `num` pairs need."""
-        try:
-            return len(self.head(item)["usable"]) >= self.pairs_of(item)
-        except (FileNotFoundError, Damaged):
-            return False
 
     def pairs_of(self, shard: int) -> int:
         return len(self.batches_of(shard)) * self.options.batch_size
+
+    def has(self, item: int) -> bool:
+        """Whether a shard exists and has all batches that the first `num` pairs need."""
+        return super().has(item) and len(self.head(item)["usable"]) >= self.pairs_of(item)
 
     def missing_pairs(self) -> int:
         return sum(map(self.pairs_of, self.missing(self.shards)))
@@ -114,17 +111,7 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
     jumps; fresh noise is a function of (seed, index, step). Batches do not depend on the process:
     shards are byte-identical for any number of processes.
     """
-    if generator.noise_shape != store.noise_shape:
-        raise InputError(
-            f"the noise of these pairs does not have the generator's shape {generator.noise_shape}."
-        )
-    flow = as_flow(generator, "a reflow pair", distilled=True)
-    sampler = store.sampler
-    sampler.check(flow)
-    check(
-        sampler.paired,
-        f"pairs are the two ends of a path, and sampler {sampler.name} leaves it: give a solver.",
-    )
+    flow = _drawer(store, generator)
     usable: list[bool] = []
     evaluations = 0
     start = time.monotonic()
@@ -147,9 +134,8 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
             bar.set(len(usable))
             if not any(usable) and (len(usable) > 64 or batch == store.batches_of(shard)[-1]):
                 raise InputError(
-                    f"none of {len(usable)} pairs came to an end with sampler {sampler.name}: the "
-                    "flow is broken, or "
-                    "the tolerance out of its reach."
+                    f"none of {len(usable)} pairs came to an end with {store.sampler.name}: the "
+                    "flow is broken, or the tolerance out of its reach."
                 )
         tensors = {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
         flags = tensors.pop("usable").astype(int).tolist()
@@ -172,6 +158,20 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
             flush=True,
         )
     return usable
+
+
+def _drawer(store: PairStore, generator: Generator) -> Flow:
+    """The generator as a flow that can draw the pairs of a store."""
+    shape = generator.noise_shape
+    check(shape == store.noise_shape, f"the noise of these pairs has not the shape {shape}.")
+    flow = as_flow(generator, "a reflow pair", distilled=True)
+    sampler = store.sampler
+    sampler.check(flow)
+    check(
+        sampler.paired,
+        f"pairs are the two ends of a path, and sampler {sampler.name} leaves it: give a solver.",
+    )
+    return flow
 
 
 def solve_batch(store: PairStore, generator: Flow, batch: int) -> dict[str, np.ndarray]:
@@ -220,7 +220,7 @@ class PairDataset(Dataset[Item]):
         store = self.store
         number = int(self.numbers[index])
         shard, offset = divmod(number, store.shard_batches * store.options.batch_size)
-        with reading_errors(path := store.files(shard)[0]), safe_open(path, framework="pt") as file:
+        with reading_errors(path := store.file(shard)), safe_open(path, framework="pt") as file:
             x_1 = file.get_slice("x_1")[offset].float()
         u = torch.tensor(noise.generator(self.seed, self.purpose, k).random(dtype=np.float32))
         item = {"x_0": store.noise(store.first + number), "x_1": x_1, "u": u, "k": torch.tensor(k)}

@@ -22,20 +22,6 @@ def is_image(path: Path) -> bool:
     return array.ndim == 3 or (array.ndim == 2 and array.dtype.kind in "iu")
 
 
-def _read_labels(path: Path, found: np.ndarray, ids: LabelList, target: Sensor) -> Partial:
-    """A map of labels, ids of a list, (H, W), of rays that were not measured."""
-    if found.shape != target.shape:
-        size = "x".join(map(str, target.shape))
-        own = "x".join(map(str, found.shape))
-        raise InputError(f"{path} is a map of labels of {own}, those of the model are {size}.")
-    image = np.zeros((3, *target.shape), np.float32)
-    with naming(path):
-        image[2] = common_classes(ids.semantic(found))
-    if not image.any():
-        raise InputError(f"{path} has no label: 0 is a ray whose class is not known.")
-    return Partial(image, np.full(target.shape, Ray.UNKNOWN, np.uint8))
-
-
 def read_partial(
     path: Path, source: Sensor | None, target: Sensor, ids: LabelList | None
 ) -> Partial:
@@ -46,33 +32,41 @@ def read_partial(
     if stored.ndim == 2:
         if ids is None:
             raise InputError(f"{path} is a map of labels: give a model with labels, -c labels.")
-        return _read_labels(path, stored, ids, target)
-    found = f"found {stored.dtype} {stored.shape}"
-    other = f"{path} must be a range image of floats (2 or 1, H, W), {found}."
-    check(stored.dtype.kind == "f" and len(stored) in (1, 2) and stored.size, other)
+        return _of_labels(path, stored, ids, target)
     image = read_range_image(path)
-    if image is None:  # empty, or points (1, N, 4)
-        raise InputError(other)
+    if image is None:
+        found = f"{stored.dtype} {stored.shape}"
+        raise InputError(f"{path} must be a range image of floats (2 or 1, H, W), found {found}.")
+    # what is not finite says nothing of its ray
     known = np.where(np.isfinite(stored), image, stored).astype(np.float32)
     wrong = wrong_with(torch.from_numpy(known), max(FAR, target.max_range))
     check(not wrong, f"{path}: {wrong}; --mask FILE.npy names what was not measured.")
     r = image[0]
-    within = not r.any() or ((r >= target.min_range) & (r <= target.max_range)).any()
-    check(
-        within,
-        f"{path}: none of its ranges lies within {target.min_range:g}-{target.max_range:g} m. Are "
-        "they in m?",
+    within = (r >= target.min_range) & (r <= target.max_range)
+    limits = f"{target.min_range:g}-{target.max_range:g} m"
+    words = f"{path}: none of its ranges lies within {limits}. Are they in m?"
+    check(within.any() or not r.any(), words)
+    rows, columns = r.shape
+    if source is not None and rows == source.shape[0]:
+        return image_through(image, source.resized(columns=columns), target)
+    if source is None and r.shape == target.shape:
+        return image_through(image, target, target)
+    model = "x".join(map(str, target.shape))
+    found = f" ({source.name} has {source.shape[0]})" if source else ""
+    raise InputError(
+        f"{path} is a range image of {rows}x{columns}, those of the model are {model}: name its "
+        f"sensor of {rows} rows by {FROM}{found}, or --size {rows}x{columns} alone with densify."
     )
-    if source is not None and image.shape[1] == source.shape[0]:
-        return image_through(image, source.resized(columns=image.shape[2]), target)
-    if source is not None or image.shape[1:] != target.shape:
-        size, model = ("x".join(map(str, shape)) for shape in (image.shape[1:], target.shape))
-        found = f" ({source.name} has {source.shape[0]})" if source else ""
-        advice = (
-            f"name its sensor of {image.shape[1]} rows by {FROM}{found}, or --size {size} alone "
-        )
-        advice += "with densify"
-        raise InputError(
-            f"{path} is a range image of {size}, those of the model are {model}: {advice}."
-        )
-    return image_through(image, target, target)
+
+
+def _of_labels(path: Path, found: np.ndarray, ids: LabelList, target: Sensor) -> Partial:
+    """A map of labels, ids of a list, (H, W), of rays that were not measured."""
+    if found.shape != target.shape:
+        size, model = ("x".join(map(str, shape)) for shape in (found.shape, target.shape))
+        raise InputError(f"{path} is a map of labels of {size}, those of the model are {model}.")
+    image = np.zeros((3, *target.shape), np.float32)
+    with naming(path):
+        image[2] = common_classes(ids.semantic(found))
+    if not image.any():
+        raise InputError(f"{path} has no label: 0 is a ray whose class is not known.")
+    return Partial(image, np.full(target.shape, Ray.UNKNOWN, np.uint8))

@@ -110,43 +110,43 @@ def refuse_other_images(store: PreparedStore, reading: Reading) -> None:
         )
 
 
+_LACKING = {
+    "reflectance": "reflectance. Set encoding.reflectance=false.",
+    "label": "labels. Prepare points that have files of labels beside them.",
+}
+
+
+def _left_out(store: PreparedStore, shard: int) -> set[int]:
+    """The numbers of the scans that were left out of a shard, which must be there."""
+    try:
+        return set(store.head(shard)["left_out"])
+    except FileNotFoundError:
+        raise InputError(
+            f"{store.folder} is not finished: the same r2flow prepare command resumes."
+        ) from None
+    except (Damaged, KeyError) as error:
+        raise InputError(
+            f"{store.file(shard)} is damaged ({error}). The same r2flow prepare makes it again."
+        ) from None
+
+
 class PreparedScans(ScanSource):
     """A source of the prepared scans of these numbers in the data set, without those left out in
     preparation.
     """
 
     def __init__(
-        self,
-        store: PreparedStore,
-        numbers: Sequence[int],
-        reflectance: bool,
-        labels: bool = False,
+        self, store: PreparedStore, numbers: Sequence[int], reflectance: bool, labels: bool = False
     ) -> None:
         self.store = store
         self.reflectance = reflectance
         self.channels = ["range", *["reflectance"] * reflectance, *["label"] * labels]
-        if reflectance and "reflectance" not in store.codes:
-            raise InputError(
-                f"{store.folder} holds scans without reflectance. Set encoding.reflectance=false."
-            )
-        if labels and "label" not in store.codes:
-            raise InputError(
-                f"{store.folder} holds scans without labels. Prepare points that have files of "
-                "labels beside them."
-            )
+        for name in self.channels:
+            if name not in store.codes:
+                raise InputError(f"{store.folder} holds scans without {_LACKING[name]}")
         places: dict[int, tuple[int, int]] = {}
         for shard, numbers_of_shard in enumerate(store.parts):
-            try:
-                left_out = set(store.head(shard)["left_out"])
-            except FileNotFoundError:
-                raise InputError(
-                    f"{store.folder} is not finished: the same r2flow prepare command resumes."
-                ) from None
-            except (Damaged, KeyError) as error:
-                path = store.files(shard)[0]
-                raise InputError(
-                    f"{path} is damaged ({error}). The same r2flow prepare makes it again."
-                ) from None
+            left_out = _left_out(store, shard)
             kept = [number for number in numbers_of_shard if number not in left_out]
             places |= {number: (shard, row) for row, number in enumerate(kept)}
         rows = [(number, *places[number]) for number in numbers if number in places]
@@ -186,7 +186,7 @@ class PreparedScans(ScanSource):
         """Hash of the headers of all shards, which contain their checksums."""
         digest = hashlib.sha256(self.store.digest.encode())
         for shard in np.unique(self.rows[:, 1]):
-            with open(self.store.files(int(shard))[0], "rb") as file:
+            with open(self.store.file(int(shard)), "rb") as file:
                 digest.update(file.read(int.from_bytes(file.read(8), "little")))
         return digest.hexdigest()
 
@@ -197,7 +197,7 @@ class PreparedScans(ScanSource):
     def __getitem__(self, index: int) -> np.ndarray:
         _, shard, row = map(int, self.rows[index])
         if shard not in self._shards:
-            path = self.store.files(shard)[0]
+            path = self.store.file(shard)
             with reading_errors(path):  # damaged since it was opened
                 file = safe_open(path, framework="numpy")
                 self._shards[shard] = {name: file.get_slice(name) for name in self.channels}

@@ -13,13 +13,14 @@ import numpy as np
 from r2flow.base.errors import InputError, check
 from r2flow.base.progress import Bar, track
 from r2flow.data.described import Described
+from r2flow.data.files import ScanFiles
 from r2flow.data.layouts import Drive
 from r2flow.data.prepared import PreparedStore
 from r2flow.data.quantise import OTHER_LEVELS, find_levels
 from r2flow.data.reading import Reading, labelled, read_image
 from r2flow.data.reflectance import lacks_reflectance
 from r2flow.data.sensor_checks import warn_of_other_sensor
-from r2flow.data.sources import ScanFiles, spread
+from r2flow.data.sources import spread
 from r2flow.store import checksum
 
 log = logging.getLogger(__name__)
@@ -98,7 +99,7 @@ def prepare(
         store.begin(drives=[[drive.name, drive.scans] for drive in store.drives])
     for shard in track(store.shards, "checking", "shards"):
         store.mend(shard)
-        file = store.files(shard)[0]
+        file = store.file(shard)
         check(
             not file.exists() or store.head(shard).get("files") == store.sources_of(shard),
             f"{file} holds scans of other files. Give another folder by {store.option}, or remove "
@@ -115,6 +116,6 @@ def prepare(
     left_out = sum(len(store.head(shard)["left_out"]) for shard in store.shards)
     if left_out == len(store.names):
         for shard in store.shards:  # so that the folder takes another recipe
-            store.files(shard)[0].unlink(missing_ok=True)
+            store.file(shard).unlink(missing_ok=True)
         raise InputError(f"all {left_out} scans were left out as unusable.")
     return left_out, missing

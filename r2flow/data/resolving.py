@@ -7,7 +7,7 @@ from typing import TypeVar
 from r2flow.base.errors import InputError
 from r2flow.base.registry import Config, Options, construct
 from r2flow.data.described import Described
-from r2flow.data.kinds import SOURCES, Layout, Prepared
+from r2flow.data.kinds import SOURCES, Layout
 from r2flow.data.options import (
     MIXED,
     PAIRS,
@@ -64,7 +64,7 @@ def plan_data(options: DataOptions, sensor: Sensor, seed: int = 0) -> DataPlan:
         parts = [PartOptions(**single)]
     sensors = [build_sensor(**part.sensor) if part.sensor else sensor for part in parts]
     weights = [part.weight for part in parts if part.weight is not None]
-    sets = [_complete(part, inherited, own) for part, own in zip(parts, sensors, strict=True)]
+    sets = [_complete(*part, inherited) for part in zip(parts, sensors, strict=True)]
     held_out = None
     if options.validation.data is not None:
         if options.name == PAIRS:
@@ -72,8 +72,8 @@ def plan_data(options: DataOptions, sensor: Sensor, seed: int = 0) -> DataPlan:
         held_out = _held_out(options, options.validation.data, sensor)
     scans = None
     if options.scans is not None:
-        beside = _checked_set("data.scans", SourceOptions, options.scans, options)
-        scans = _complete(beside, _of_other_files(inherited), sensor)
+        beside = _checked_set("data.scans", SourceOptions, options.scans)
+        scans = _complete(beside, sensor, _of_other_files(inherited))
     plan = DataPlan(sets, sensors, weights, held_out, scans)
     first_scene = 0  # parts and held-out scans have different simulated scenes
     for one in plan.all:
@@ -85,11 +85,11 @@ def plan_data(options: DataOptions, sensor: Sensor, seed: int = 0) -> DataPlan:
 
 def _of_other_files(reading: Config) -> Config:
     """What a reading says of other files, too, with other columns and scale."""
-    own = ("columns", "reflectance_scale")
-    return {key: value for key, value in reading.items() if key not in own}
+    of_files = ("columns", "reflectance_scale")
+    return {key: value for key, value in reading.items() if key not in of_files}
 
 
-def _complete(source: SourceOptions, inherited: Config, sensor: Sensor) -> Described:
+def _complete(source: SourceOptions, sensor: Sensor, inherited: Config) -> Described:
     """A set of scans with all fields of its reading: its own, else `inherited`, else the defaults
     of its kind.
     """
@@ -119,7 +119,7 @@ def _parts(run: DataOptions) -> list[PartOptions]:
         options = {"scenes": run.scenes, **part}
         if part.get("sensor") is not None:
             options["sensor"] = sensor_options(part["sensor"])
-        parts.append(_checked_set(f"data.parts[{number}]", PartOptions, options, run))
+        parts.append(_checked_set(f"data.parts[{number}]", PartOptions, options))
     if len({part.weight is None for part in parts}) > 1:
         raise InputError("data.parts: give every part a weight, or none, for shares by size.")
     return parts
@@ -131,11 +131,11 @@ def _held_out(run: DataOptions, other: Options, sensor: Sensor) -> Described:
     if options["name"] != run.name:
         inherited = _of_other_files(inherited)
         options["root"] = other.get("root")
-    held = _checked_set("data.validation.data", SourceOptions, options, run)
-    return _complete(held, inherited, sensor)
+    held = _checked_set("data.validation.data", SourceOptions, options)
+    return _complete(held, sensor, inherited)
 
 
-def _checked_set(what: str, kind: type[Source], options: Options, run: DataOptions) -> Source:
+def _checked_set(what: str, kind: type[Source], options: Options) -> Source:
     """One set of scans. Refuses a data set with a standard split of which no part is named."""
     source = construct(what, kind, options)
     if options.get("name") in (None, MIXED, PAIRS):
@@ -147,9 +147,6 @@ def _checked_set(what: str, kind: type[Source], options: Options, run: DataOptio
             "all."
         )
     _refuse_ignored(what, source)
-    of_files = isinstance(SOURCES[source.name], Layout | Prepared)
-    if of_files and options.get("scenes") not in (None, run.scenes):
-        raise InputError(f"{what}.scenes does nothing for {source.name} scans: leave it out.")
     return source
 
 

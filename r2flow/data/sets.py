@@ -1,6 +1,5 @@
 """A set of scans for commands and reports: numbered range images with their metadata."""
 
-import copy
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property, partial
@@ -10,29 +9,38 @@ from torch import Tensor
 from torch.utils.data import DataLoader, default_collate
 
 from r2flow.base.noise import generator
+from r2flow.base.registry import Options
 from r2flow.base.signals import blocking_signals, init_loader_worker
 from r2flow.data.sources import ScanSource, drives_within, spread
 from r2flow.lidar.sensors import Sensor
-from r2flow.store import checksum
 
 
 class ScanSet:
-    """Scans of a sensor; `label` is the user's name for them. `about`, `identity`, `drives` are as
-    in `ScanSource`.
+    """Scans of a sensor; `label` is the user's name for them, `part` describes which of them.
+    `about`, `identity`, `drives` are as in `ScanSource`.
     """
 
-    def __init__(self, label: str, source: ScanSource, sensor: Sensor) -> None:
+    def __init__(
+        self,
+        label: str,
+        source: ScanSource,
+        sensor: Sensor,
+        part: str | None = None,
+        drives: Mapping[str, Sequence[int]] | None = None,
+    ) -> None:
         self.label = label
         self.source = source
         self.sensor = sensor
-        self.drives = source.drives
+        self.drives = source.drives if drives is None else drives
+        self._part = part
 
     @cached_property
-    def about(self) -> Mapping[str, Any]:
-        return self.source.about()
+    def about(self) -> Options:
+        about = self.source.about()
+        return about if self._part is None else {**about, "part": self._part}
 
     @cached_property
-    def identity(self) -> Mapping[str, Any] | None:
+    def identity(self) -> Options | None:
         return self.source.identity()
 
     def __len__(self) -> int:
@@ -46,22 +54,15 @@ class ScanSet:
 
     def part(self, numbers: Sequence[int], name: str) -> "ScanSet":
         """Some of the scans, in the given order; `name` describes the selection."""
-        part = copy.copy(self)
-        part.source = self.source.subset(numbers)
-        part.about = {**self.about, "part": name}
-        if self.identity is not None:  # a part of a part differs from the same numbers of the whole
-            chosen = [self.identity.get("part"), *numbers]
-            part.identity = {**self.identity, "part": checksum(chosen)[:16]}
-        part.drives = drives_within(self.drives, numbers)
-        return part
+        drives = drives_within(self.drives, numbers)
+        return ScanSet(self.label, self.source.subset(numbers), self.sensor, name, drives)
 
     def limited(self, most: int | None) -> "ScanSet":
         """At most `most` scans, by `fixed_choice`."""
         if most is None or most >= len(self):
             return self
-        return self.part(
-            fixed_choice(len(self), most), f"{most} of {len(self)}, fixed shuffle, seed 0"
-        )
+        numbers = fixed_choice(len(self), most)
+        return self.part(numbers, f"{most} of {len(self)}, fixed shuffle, seed 0")
 
     def spread(self, most: int) -> "ScanSet":
         """At most `most` scans, evenly spread over all."""

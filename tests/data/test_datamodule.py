@@ -11,9 +11,10 @@ from r2flow.base import noise
 from r2flow.base.errors import InputError
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.described import describe
+from r2flow.data.files import ScanFiles
 from r2flow.data.prepared import PreparedScans
 from r2flow.data.resolving import reflectance_levels
-from r2flow.data.sources import InMemory, ScanFiles
+from r2flow.data.sources import InMemory
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
@@ -140,7 +141,6 @@ def mixture(part) -> dict:
         (mixture({**FOLDER, "weight": 1}), "every part a weight"),
         (mixture({"name": "simulated", "sensor": {"name": "vlp"}}), "no sensor named .vlp"),
         (mixture({**FOLDER, "weight": 0}), "weight: input should be greater than 0, found 0"),
-        (mixture({**FOLDER, "scenes": 7}), r"data.parts\[0\].scenes does nothing for folder scans"),
         (
             {"validation": {"data": {"name": "simulated", "drives": [1]}}},
             "data.drives does nothing for simulated",

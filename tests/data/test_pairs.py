@@ -173,7 +173,7 @@ def test_an_item_has_the_pair_s_noise_and_the_run_s_time(tmp_path: Path):
     assert 0 <= float(item["u"]) != float(dataset[(71, 11)]["u"]) < 1
     again = pickle.loads(pickle.dumps(dataset))  # as a loader's worker has it
     assert all(torch.equal(again[(70, 11)][key], item[key]) for key in item)
-    store.files(0)[0].write_bytes(b"damaged during the run")
+    store.file(0).write_bytes(b"damaged during the run")
     with pytest.raises(
         InputError, match=r"pairs-000000.safetensors is not a readable .safetensors file"
     ):

@@ -17,6 +17,7 @@ from safetensors.numpy import load_file
 from r2flow.base.errors import InputError
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.described import Described, describe
+from r2flow.data.files import ScanFiles
 from r2flow.data.kinds import SOURCES
 from r2flow.data.layouts import Drive
 from r2flow.data.options import SourceOptions
@@ -24,7 +25,6 @@ from r2flow.data.prepared import PreparedStore, refuse_other_images
 from r2flow.data.preparing import plan, prepare
 from r2flow.data.quantise import find_levels, range_codes, reflectance_codes
 from r2flow.data.reading import Reading, read_image
-from r2flow.data.sources import ScanFiles
 from r2flow.lidar.labels import COMMON
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor

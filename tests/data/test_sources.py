@@ -7,8 +7,10 @@ import pytest
 
 from r2flow import simulator
 from r2flow.base.errors import InputError
+from r2flow.data.files import ScanFiles
 from r2flow.data.reading import Reading, read_image
-from r2flow.data.sources import InMemory, ScanFiles, SimulatedScans, holdout_block
+from r2flow.data.simulated import SimulatedScans
+from r2flow.data.sources import InMemory, holdout_block
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS
 from tests.conftest import memory_below, numbers, write_scan
@@ -89,7 +91,7 @@ def test_whole_drives_are_held_out_where_they_come_within_half_of_the_share():
 
 def test_many_simulated_scans_are_kept_on_the_disk(tmp_path, monkeypatch):
     monkeypatch.setenv("R2FLOW_CACHE", str(tmp_path))
-    monkeypatch.setattr("r2flow.data.sources.WORTH_KEEPING", 3)
+    monkeypatch.setattr("r2flow.data.simulated.WORTH_KEEPING", 3)
     sensor = SENSORS["hdl64e"].resized(8, 16)
     scans = SimulatedScans(sensor, 5, range(7, 10), reflectance=True)
     shape = (2, 8, 16)

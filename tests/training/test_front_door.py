@@ -257,7 +257,7 @@ def test_a_sensors_file_gives_way_to_keys_before_and_after_it(tmp_path: Path):
     ]
     assert sensor["elevations"] == list(SENSORS["vlp16"].elevations)
     part = {"name": "simulated", "sensor": str(tmp_path / "my sensor.YAML")}
-    (own,) = ScanDataModule("mixed", parts=[part]).sensors
+    (own,) = ScanDataModule("mixed", parts=[part]).plan.sensors
     assert own == replace(SENSORS["vlp16"], name="mine")
     # a built-in sensor by its name
     (tmp_path / "own.yaml").write_text("{name: hdl32e, rows: 16, rays: centre}")

@@ -11,13 +11,15 @@ from numpy import ndarray
 from r2flow.base.errors import InputError
 from r2flow.base.progress import Bar
 from r2flow.data.described import Described
+from r2flow.data.files import ScanFiles
 from r2flow.data.opening import open_each, open_scans
 from r2flow.data.options import FOLDER, SIMULATED
 from r2flow.data.reading import Reading, read_labelled_scan
 from r2flow.data.reflectance import estimated_scale
 from r2flow.data.sensor_checks import readable, warn_of_other_sensor
 from r2flow.data.sets import ScanSet
-from r2flow.data.sources import ScanFiles, ScanSource, SimulatedScans
+from r2flow.data.simulated import SimulatedScans
+from r2flow.data.sources import ScanSource
 from r2flow.lidar.labels import SEMANTIC_KITTI, labels_beside
 from r2flow.lidar.scan_files import points_beside, read_range_image
 from r2flow.model.checkpoint import Checkpoint
