@@ -83,7 +83,7 @@ def test_the_last_finite_state_is_kept():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_growth_beyond_float32_is_flagged(method):
-    solution = solve(lambda t, x: 1e3 * x, X_0, method=method, steps=64, tolerance=1e-3)
+    solution = solve(lambda t, x: 1e3 * x, X_0[:1], method=method, steps=64, tolerance=1e-3)
     assert not solution.converged.any()
     assert solution.x.isfinite().all()
 
@@ -184,8 +184,8 @@ def test_a_network_that_is_being_trained_can_be_solved(method):
 
 def test_exponential_steps_refuse_to_lose_a_gradient():
     for weight, x in (
-        (torch.ones(1, requires_grad=True), X_0),
-        (torch.ones(1), X_0.clone().requires_grad_()),
+        (torch.ones(1, requires_grad=True), X_0[:1]),
+        (torch.ones(1), X_0[:1].clone().requires_grad_()),
     ):
         velocity = partial(lambda weight, t, x: weight * StiffLinear(1e6)(t, x), weight)
         with pytest.raises(
@@ -235,7 +235,7 @@ def most_alive(method: str, steps: int, tolerance: float) -> tuple[int, int]:
         return v
 
     solution = solve(
-        velocity, torch.randn(2, 2, 4, 8), method=method, steps=steps, tolerance=tolerance
+        velocity, torch.randn(1, 2, 2, 4), method=method, steps=steps, tolerance=tolerance
     )
     return most, int(solution.evaluations.max())
 
