@@ -86,3 +86,4 @@ def test_the_names_of_backbones_are_those_of_the_error():
         BACKBONES["hditt"]
     assert f"known: {', '.join(BACKBONES)}. Did" in str(error.value)
     assert BACKBONES["hdit_tiny"].keywords["base_channels"] == 48
+    assert len(list(BACKBONES)) == len(BACKBONES) > len(BACKBONES._entries)

@@ -25,7 +25,7 @@ class _Backbones(Registry[Callable[..., Backbone]]):
         return iter(sorted({*self._entries, *presets(self.kind)}))
 
     def __len__(self) -> int:
-        return len([*self])
+        return sum(1 for _ in self)
 
     def __contains__(self, name: object) -> bool:
         return name in presets(self.kind) or super().__contains__(name)

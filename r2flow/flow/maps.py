@@ -8,6 +8,7 @@ derivatives.
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -30,6 +31,7 @@ def jump(u: MeanVelocity, t: Tensor, x: Tensor, s: Tensor) -> Tensor:
     return x + expand_time(s - t, x) * u(t, x, s)
 
 
+@dataclass
 class JumpTimes:
     """Distribution of the jumps (t, s) in training: steps of grids, velocities, ends, others.
 
@@ -49,31 +51,27 @@ class JumpTimes:
             with NaN.
     """
 
-    def __init__(
-        self,
-        steps: Sequence[int] = (1, 1, 1, 2, 4, 8),
-        grid: str = "uniform",
-        share: Portion = 0.55,
-        diagonal: Portion = 0.55,
-        ends: Portion = 0.0,
-        time: Options | None = None,
-    ) -> None:
-        if diagonal + ends > 1:
-            raise InputError(f"diagonal + ends must be at most 1; found {diagonal}, {ends}.")
-        self.grid = grid
-        self.share = share
-        self.diagonal = diagonal
-        self.ends = ends
-        self.velocities = TIMES.build(time or {"name": "u_shaped"})
-        self.steps = torch.tensor(steps)
-        grids = [build_grid(grid, 0.0, 1.0, count) for count in steps]
+    steps: Sequence[int] = (1, 1, 1, 2, 4, 8)
+    grid: str = "uniform"
+    share: Portion = 0.55
+    diagonal: Portion = 0.55
+    ends: Portion = 0.0
+    time: Options | None = None
+
+    def __post_init__(self) -> None:
+        if self.diagonal + self.ends > 1:
+            raise InputError(
+                f"diagonal + ends must be at most 1; found {self.diagonal}, {self.ends}."
+            )
+        self.velocities = TIMES.build(self.time or {"name": "u_shaped"})
+        grids = [build_grid(self.grid, 0.0, 1.0, count) for count in self.steps]
         self.times = pad_sequence(grids, batch_first=True, padding_value=math.nan)
 
     def __call__(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Draw t and s, (B,) each, from uniform numbers in [0, 1), (B, 3)."""
         which, a, b = u.unbind(1)
         times = self.times.to(u)
-        counts = self.steps.to(u.device)
+        counts = torch.tensor(self.steps, device=u.device)
         row = (a * len(counts)).long()
         step = (b * counts[row]).long()
         velocity = self.velocities(a)

@@ -81,7 +81,7 @@ class _Scene:
         speed = _rms(f / self._scale(self.u))
         h = (0.01 / speed) ** 0.25 if speed > 0 else self.length
         while self.s < self.length and f.isfinite().all():
-            krylov = _Krylov(partial(self.product, f), torch.cat([f, f.new_ones(1)]))
+            krylov = self._space(f, f, 1.0)
             left = self.length - self.s
             error = math.inf
             while error > 1:
@@ -124,7 +124,10 @@ class _Scene:
         most = (self.length - self.s) / max(abs(later), 1e-300)
         step = math.copysign(min(self.difference / size, most), later)
         ahead = self.slope(self.s + step * later, self.u + step * moved)
-        return torch.cat([(ahead - f) / step, f.new_zeros(1)])
+        return _joined((ahead - f) / step, 0.0)
+
+    def _space(self, f: Tensor, x: Tensor, s: float) -> "_Krylov":
+        return _Krylov(partial(self.product, f), _joined(x, s))
 
     def _scale(self, u: Tensor) -> Tensor:
         return self.tolerance * (1 + u.abs())
@@ -153,7 +156,7 @@ class _Scene:
         error = _error(fourth / scale)
         if error <= 1 and not torch.equal(end, linear):
             following = self.slope(self.s + h, end)
-            along = self.product(f, torch.cat([end - self.u, end.new_full((1,), h)]))[:-1]
+            along = self.product(f, _joined(end - self.u, h))[:-1]
             missed = self._filtered(f, 3, following - f - along - whole, h, scale)
             error = max(error, _error(missed / scale))
         if not (end + following).isfinite().all():
@@ -171,7 +174,7 @@ class _Scene:
         """h phi_order(h J) times a vector: 0 if negligible, NaN if the space is too small."""
         if h * _rms(start / scale) <= _KRYLOV:
             return torch.zeros_like(start)
-        space = _Krylov(partial(self.product, f), torch.cat([start, start.new_zeros(1)]))
+        space = self._space(f, start, 0.0)
         if not space.enough(order, h, scale):
             return torch.full_like(start, math.nan)
         return h * space.vector(space.combination(order, h))[:-1]
@@ -244,6 +247,11 @@ class _Krylov:
 
     def image(self, y: ndarray) -> Tensor:
         return self.vector(self.matrix[: len(y) + 1, : len(y)] @ y)
+
+
+def _joined(x: Tensor, s: float) -> Tensor:
+    """The vector (x, s)."""
+    return torch.cat([x, x.new_full((1,), s)])
 
 
 def _error(x: Tensor) -> float:

@@ -107,10 +107,7 @@ DISCRIMINATORS = Registry(
 _ALL_DEFAULTS: Options = {}
 
 # Parts of a step, with separate random draws per image.
-_GENERATOR = 1
-_FAKE = 2
-_REAL = 3
-_PENALTY = 4
+_GENERATOR, _FAKE, _REAL, _PENALTY = 1, 2, 3, 4
 
 
 class LearnGan(Stage):
@@ -182,24 +179,27 @@ class LearnGan(Stage):
         images = step * self.images_per_step
         real = batch["x_1"]
 
-        draws = BatchDraws(self.hparams["seed"], batch, _GENERATOR)
+        def drawn(part: int) -> BatchDraws:
+            return BatchDraws(self.hparams["seed"], batch, part)
+
+        draws = drawn(_GENERATOR)
         self.discriminator.requires_grad_(False)
         shown = self._shown(self._make(batch["x_0"], draws), images, draws)
         loss = _generator_loss(self.discriminator(shown))
         self.take_step(for_generator, loss)
         self.discriminator.requires_grad_(True)
 
-        draws = BatchDraws(self.hparams["seed"], batch, _FAKE)
+        draws = drawn(_FAKE)
         with torch.no_grad():
             z = draws.normal(*self.generator.noise_shape).to(real.device)
             fake = self._shown(self._make(z, draws), images, draws)
-            seen = self._shown(real, images, BatchDraws(self.hparams["seed"], batch, _REAL))
+            seen = self._shown(real, images, drawn(_REAL))
         of_real = self.discriminator(seen)
         wrong = _discriminator_loss(of_real, self.discriminator(fake))
         self.take_step(for_discriminator, wrong)
 
         if self.r1 and step % self.r1_every == 0:
-            penalty = self._penalty(real, images, BatchDraws(self.hparams["seed"], batch, _PENALTY))
+            penalty = self._penalty(real, images, drawn(_PENALTY))
             self.take_step(for_discriminator, self.r1 * self.r1_every / 2 * penalty)
             self.last_r1 = penalty.detach()
         if self.last_r1 is not None:
