@@ -50,6 +50,7 @@ from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
 log = logging.getLogger(__name__)
 
 Scans = Mixture | np.ndarray  # scans, or the numbers of pairs
+HeldOut = DataLoader[Item] | list[Any]  # an empty list: there are none
 
 
 class ScanDataModule(L.LightningDataModule, NamedArguments):
@@ -361,15 +362,15 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
         sensors = self.plan.sensors if whole_sets else []
         return FlowDataset(source, item_format, self.seed, purpose, augment, sensors)
 
-    def val_dataloader(self) -> DataLoader[Item] | list[Any]:
+    def val_dataloader(self) -> HeldOut:
         """The held-out scans, each once over all devices."""
         return self._held_out()
 
-    def test_dataloader(self) -> DataLoader[Item] | list[Any]:
+    def test_dataloader(self) -> HeldOut:
         """The held-out scans, each once over all devices, to compare generated scans with."""
         return self._held_out(whole=True)
 
-    def predict_dataloader(self) -> DataLoader[Item] | list[Any]:
+    def predict_dataloader(self) -> HeldOut:
         """The held-out scans, each once over all devices, some of which may have none."""
         return self._held_out(whole=True, idle=True)
 
@@ -379,17 +380,14 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
         _, source = self._ready()
         return len(source) >= self.ranks[1]
 
-    def _held_out(self, whole: bool = False, idle: bool = False) -> DataLoader[Item] | list[Any]:
+    def _held_out(self, whole: bool = False, idle: bool = False) -> HeldOut:
         """Batches of the held-out scans; `whole`: without the stage's further entries; `idle`:
         devices may have none.
         """
         _, source = self._ready()
         if len(source) == 0:
             return []
-        rank, ranks = self.ranks
-        if not (self.shares_held_out or idle):
-            rank = 0
-            ranks = 1
+        rank, ranks = self.ranks if self.shares_held_out or idle else (0, 1)
         batch_size = max(self.batch_size // ranks, 1)
         least, more = divmod(len(source), ranks)
         if least and more and least % batch_size == 0:

@@ -3,7 +3,7 @@
 import hashlib
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, cached_property
@@ -68,35 +68,36 @@ class ScanFiles(ScanSource):
     @cached_property
     def _digest(self) -> str:
         """Hash of names, sizes and times of change; a file unpacked anew has another `ctime`."""
-        stats = [(*named, stat.st_mtime_ns, stat.st_ctime_ns) for *named, stat in self._stats()]
-        return checksum(stats)
+        return checksum(self._listed("st_mtime_ns", "st_ctime_ns"))
 
     @property
     def contents(self) -> str:  # type: ignore[override]
         """Hash of names and sizes, and of the contents of some files: unpacked archives can have
         equal names and sizes.
         """
-        hashes = []
+        listed = self._listed()
         files = self._files()
         for path in [files[number] for number in spread(len(files), 8)]:
             with suppress(OSError):
                 if os.path.isfile(path):  # a pipe would block, a device never end
                     with open(path, "rb") as file:
-                        hashes.append(hashlib.file_digest(file, "sha256").hexdigest())
-        return checksum([*(named for *named, _ in self._stats()), *hashes])
+                        listed.append(hashlib.file_digest(file, "sha256").hexdigest())
+        return checksum(listed)
 
     def _files(self) -> list[str | Path]:
         """The scans' files, and with labels theirs."""
         found = map(labels_beside, self.paths) if self.reading.labels else ()
         return [*self.paths, *filter(None, found)]
 
-    def _stats(self) -> Iterator[tuple[Any, ...]]:
-        """Name and size of each file, with labels also the list of their ids; and its `stat`."""
-        ids = self.reading.label_ids.ids if self.reading.labels else None
+    def _listed(self, *times: str) -> list[Any]:
+        """Names, sizes and times of change of the files, with labels also the ids' list."""
+        listed: list[Any] = [self.reading.label_ids.ids] if self.reading.labels else []
         for path in self._files():
             with suppress(OSError):  # reported when the scan is read
                 stat = os.stat(path)
-                yield self._name(path), stat.st_size, ids, stat
+                changes = (getattr(stat, time) for time in times)
+                listed.append([self._name(path), stat.st_size, *changes])
+        return listed
 
     def places(self) -> set[str]:
         real = cache(os.path.realpath)  # slow on network disks

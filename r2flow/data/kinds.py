@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+HowRead = Reading | ReadingOptions
+
 
 @dataclass(frozen=True, kw_only=True)
 class SourceKind(ABC):
@@ -44,9 +46,7 @@ class SourceKind(ABC):
     def open(self, scans: "Described", reading: Reading) -> ScanSource:
         """The scans in order, not yet read; `reading.reflectance` is True or False."""
 
-    def lacks_reflectance(
-        self, scans: "Described", reading: Reading | ReadingOptions
-    ) -> str | None:
+    def lacks_reflectance(self, scans: "Described", reading: HowRead) -> str | None:
         """Reason why the scans count as without reflectance; None if they have it."""
         return None
 
@@ -138,9 +138,7 @@ class Layout(SourceKind):
             first += len(drive.scans)
         return ScanFiles(scans.paths, reading, options.folder, numbers, about)
 
-    def lacks_reflectance(
-        self, scans: "Described", reading: Reading | ReadingOptions
-    ) -> str | None:
+    def lacks_reflectance(self, scans: "Described", reading: HowRead) -> str | None:
         with leaving_out(reading.on_bad_scan == "error" and not scans.file):
             return lacks_reflectance(scans.paths, reading.on_bad_scan, reading.columns)
 
@@ -161,9 +159,7 @@ class Prepared(SourceKind):
         numbers = [place[name] for drive in drives for name in drive.scans]
         return PreparedScans(store, numbers, bool(reading.reflectance), reading.labels)
 
-    def lacks_reflectance(
-        self, scans: "Described", reading: Reading | ReadingOptions
-    ) -> str | None:
+    def lacks_reflectance(self, scans: "Described", reading: HowRead) -> str | None:
         if self.levels_of(scans) is None:
             return f"the scans in {scans.options.folder} have no reflectance"
         return None

@@ -10,10 +10,8 @@ import numpy as np
 import torch
 
 from r2flow.base.errors import InputError
-from r2flow.data.kinds import SOURCES, SourceKind
-from r2flow.data.options import ReadingOptions
-from r2flow.data.reading import Reading
-from r2flow.data.sources import ScanSource, spread
+from r2flow.data.kinds import SOURCES, HowRead, SourceKind
+from r2flow.data.sources import MadeScans, spread
 
 if TYPE_CHECKING:
     from r2flow.data.described import Described
@@ -22,36 +20,27 @@ DATASET = "dataset"  # name of a data set that is given as it is
 _LOOKED_AT = 8  # scans whose values identify the data set
 
 
-class DatasetScans(ScanSource):
+@dataclass(eq=False)
+class DatasetScans(MadeScans):
     """Items of a map-style `Dataset`: images (2 or 1, H, W), range in metres and reflectance in
     [0, 1], 0 without a return, or dicts with such an `image`.
     """
 
     slow = True
+    word = "item"
 
-    def __init__(self, dataset: Any, indices: Sequence[int] | None = None) -> None:
-        self.dataset = dataset
-        self.indices = range(len(dataset)) if indices is None else indices
-
-    def __len__(self) -> int:
-        return len(self.indices)
+    dataset: Any
+    numbers: Sequence[int]
 
     def __getitem__(self, index: int) -> np.ndarray:
-        item = self.dataset[self.indices[index]]
+        item = self.dataset[self.numbers[index]]
         image = item["image"] if isinstance(item, dict) else item
         return torch.as_tensor(image, dtype=torch.float32).numpy()
-
-    @property
-    def names(self) -> list[str]:
-        return [str(index) for index in self.indices]
 
     @property
     def contents(self) -> str:  # type: ignore[override]
         looked_at = [self[index].tobytes() for index in spread(len(self), _LOOKED_AT)]
         return hashlib.sha256(b"".join(looked_at)).hexdigest()
-
-    def subset(self, indices: Sequence[int]) -> "DatasetScans":
-        return DatasetScans(self.dataset, [self.indices[index] for index in indices])
 
 
 @dataclass(frozen=True)
@@ -63,13 +52,12 @@ class DatasetKind(SourceKind):
 
     make: Callable[[Path | None], Any]
 
-    def open(self, scans: "Described", reading: Reading) -> DatasetScans:
-        return DatasetScans(self._made(scans))
+    def open(self, scans: "Described", reading: HowRead) -> DatasetScans:
+        dataset = self._made(scans)
+        return DatasetScans(dataset, range(len(dataset)))
 
-    def lacks_reflectance(
-        self, scans: "Described", reading: Reading | ReadingOptions
-    ) -> str | None:
-        channels = len(DatasetScans(self._made(scans))[0])
+    def lacks_reflectance(self, scans: "Described", reading: HowRead) -> str | None:
+        channels = len(self.open(scans, reading)[0])
         return f"the images of {scans.options.name} have one channel" if channels == 1 else None
 
     def _made(self, scans: "Described") -> Any:

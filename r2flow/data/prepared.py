@@ -94,14 +94,16 @@ def refuse_other_images(store: PreparedStore, reading: Reading) -> None:
     """
     # Images do not depend on these fields; the order of the lasers determines the rows in unfolding
     # only.
-    irrelevant = {"name", "height"}
+    irrelevant = {"sensor.name", "sensor.height"}
     if reading.projection != "unfolding":
-        irrelevant.add("firing")
-    images = []
-    for fields in (store.described["reading"], reading.described()):
-        image = {**fields["sensor"], **{key: fields[key] for key in ("projection", "convention")}}
-        images.append({key: value for key, value in image.items() if key not in irrelevant})
-    if differing := [*differences(*images).values()]:
+        irrelevant.add("sensor.firing")
+    found = differences(store.described["reading"], reading.described())
+    differing = [
+        text
+        for key, text in found.items()
+        if key.startswith(("sensor.", "projection", "convention")) and key not in irrelevant
+    ]
+    if differing:
         stored = store.reading
         raise InputError(
             f"{store.folder} was prepared for other images (sensor {stored.sensor}, "

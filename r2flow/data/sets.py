@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
 
@@ -15,29 +16,24 @@ from r2flow.data.sources import ScanSource, drives_within, spread
 from r2flow.lidar.sensors import Sensor
 
 
+@dataclass(eq=False)
 class ScanSet:
-    """Scans of a sensor; `label` is the user's name for them, `part` describes which of them.
-    `about`, `identity`, `drives` are as in `ScanSource`.
-    """
+    """Scans of a sensor. `about`, `identity`, `drives` are as in `ScanSource`."""
 
-    def __init__(
-        self,
-        label: str,
-        source: ScanSource,
-        sensor: Sensor,
-        part: str | None = None,
-        drives: Mapping[str, Sequence[int]] | None = None,
-    ) -> None:
-        self.label = label
-        self.source = source
-        self.sensor = sensor
-        self.drives = source.drives if drives is None else drives
-        self._part = part
+    label: str  # the user's name for them
+    source: ScanSource
+    sensor: Sensor
+    subset: str | None = None  # which of them, if not all
+    drives: Mapping[str, Sequence[int]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.subset is None:
+            self.drives = self.source.drives
 
     @cached_property
     def about(self) -> Options:
         about = self.source.about()
-        return about if self._part is None else {**about, "part": self._part}
+        return about if self.subset is None else {**about, "part": self.subset}
 
     @cached_property
     def identity(self) -> Options | None:

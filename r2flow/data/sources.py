@@ -1,10 +1,10 @@
 """Sources of numbered range images in metres."""
 
 import copy
-import logging
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -14,8 +14,6 @@ from torch import Tensor
 from r2flow.base.errors import InputError
 from r2flow.base.progress import track
 from r2flow.base.registry import Config
-
-log = logging.getLogger(__name__)
 
 
 class ScanSource(ABC):
@@ -109,14 +107,12 @@ class MadeScans(ScanSource):
         return part
 
 
+@dataclass(eq=False)
 class InMemory(ScanSource):
     """Named images in memory, (N, 2 or 1, H, W)."""
 
-    names: Sequence[str] = ()  # set for each instance; the base class has a property
-
-    def __init__(self, images: np.ndarray, names: Sequence[str]) -> None:
-        self.images = images
-        self.names = names
+    images: np.ndarray
+    names: Sequence[str] = ()  # a default, since the base class has an abstract property
 
     def subset(self, indices: Sequence[int]) -> "InMemory":
         return InMemory(self.images[list(indices)], [self.names[i] for i in indices])
