@@ -11,7 +11,7 @@ from r2flow.backbones.base import Backbone
 from r2flow.backbones.efficient_unet import EfficientUNet
 from r2flow.backbones.hdit import HDiT
 from r2flow.backbones.local import Local
-from r2flow.backbones.own import OWN, own_backbone
+from r2flow.backbones.module import MODULE, module_backbone
 from r2flow.backbones.vit import ViT
 from r2flow.base.errors import InputError
 from r2flow.base.registry import Config, Options, Registry, presets
@@ -31,8 +31,8 @@ class _Backbones(Registry[Callable[..., Backbone]]):
         return name in presets(self.kind) or super().__contains__(name)
 
     def __getitem__(self, name: str) -> Callable[..., Backbone]:
-        if name == OWN:
-            return own_backbone
+        if name == MODULE:
+            return module_backbone
         if name in self._entries or name not in self:
             return super().__getitem__(name)
         options = self.options(name)
@@ -41,7 +41,7 @@ class _Backbones(Registry[Callable[..., Backbone]]):
     def options(self, given: str | Options | nn.Module) -> Config:
         """As `Registry.options`; also of a module of one's own."""
         if isinstance(given, nn.Module):
-            return {"name": OWN, "network": given}
+            return {"name": MODULE, "network": given}
         return super().options(given)
 
     def build(  # type: ignore[override]

@@ -206,8 +206,8 @@ class StreetBuilder(ObjectBuilder):
             if not self._clear(street, pose, 5.0) or pose.away < _CLEAR:
                 continue
             ahead, lateral = main.locate(pose.x, pose.y)
-            own_path = abs(lateral + main.offset) < 2.6 and abs(ahead) < 30
-            if own_path or not self.chance(taken):
+            in_ego_path = abs(lateral + main.offset) < 2.6 and abs(ahead) < 30
+            if in_ego_path or not self.chance(taken):
                 continue
             if self.chance(0.04) and not nose_in:
                 self.truck(pose)

@@ -15,7 +15,7 @@ from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from r2flow.backbones.own import OwnNetwork
+from r2flow.backbones.module import ModuleBackbone
 from r2flow.base.arguments import NamedArguments
 from r2flow.base.errors import InputError, naming
 from r2flow.base.noise import seed_torch
@@ -210,7 +210,7 @@ class Stage(L.LightningModule, NamedArguments):
     def backbone(self) -> nn.Module:
         """The network v(t, x); a module of one's own as it was given."""
         network: Any = self.generator.backbone
-        return network.network if isinstance(network, OwnNetwork) else network
+        return network.network if isinstance(network, ModuleBackbone) else network
 
     @property
     def encoding(self) -> Encoding:

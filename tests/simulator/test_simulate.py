@@ -75,9 +75,9 @@ def test_streets_join_and_objects_stand_apart_and_off_the_carriageways(seed, ind
 
 def digests() -> list[str]:
     views = [
-        (HDL64E.resized(32, 512), 4),
-        (SENSORS["os1_64"].resized(32, 256), 3),
-        (SENSORS["vlp16"], 3),
+        (HDL64E.resized(32, 512), 3),
+        (SENSORS["os1_64"].resized(32, 256), 2),
+        (SENSORS["vlp16"], 1),
     ]
     return [digest(sensor, 7, k) for sensor, count in views for k in range(count)]
 

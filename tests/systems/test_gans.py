@@ -271,9 +271,9 @@ def draws_of(count: int) -> BatchDraws:
 
 
 def test_augmentation_draws_the_published_distributions():
-    draws = AdaptiveAugment(initial=1.0).draw(draws_of(20_000))
+    draws = AdaptiveAugment(initial=1.0).draw(draws_of(10_000))
     assert list(draws) == list(TRANSFORMATIONS)
-    for name, draw in AdaptiveAugment(initial=0.4).draw(draws_of(20_000)).items():
+    for name, draw in AdaptiveAugment(initial=0.4).draw(draws_of(10_000)).items():
         applied = draw == draws[name]
         assert (applied | (draw == TRANSFORMATIONS[name].identity)).all()
         share = (
@@ -293,7 +293,7 @@ def test_augmentation_draws_the_published_distributions():
         assert values.std().item() == pytest.approx(deviation, rel=0.03), name
     for name, octaves in (("iso_scale", 0.2), ("contrast", 0.5)):
         assert draws[name].log2().std().item() == pytest.approx(octaves, rel=0.03), name
-    assert draws["int_trans"].shape == draws["frac_trans"].shape == (2, 20_000)
+    assert draws["int_trans"].shape == draws["frac_trans"].shape == (2, 10_000)
 
 
 def test_augmentation_of_probability_0_keeps_the_image():

@@ -7,10 +7,10 @@ from torch import Tensor, nn
 from r2flow.backbones.base import Backbone
 from r2flow.base.errors import InputError
 
-OWN = "own"  # its name in a config, where `network` is its class
+MODULE = "own"  # its name in a config, where `network` is its class
 
 
-class OwnNetwork(Backbone):
+class ModuleBackbone(Backbone):
     """v(t, x) by any module that takes t, (B,), and x, (B, C, H, W)."""
 
     def __init__(self, rays: Tensor, network: nn.Module, **common: Any) -> None:
@@ -21,7 +21,7 @@ class OwnNetwork(Backbone):
         return self.network(t.expand(len(x)), x)
 
 
-def own_backbone(rays: Tensor, network: nn.Module | str, **common: Any) -> Backbone:
+def module_backbone(rays: Tensor, network: nn.Module | str, **common: Any) -> Backbone:
     """A module as a backbone; itself if it is one.
 
     Raises:
@@ -32,4 +32,4 @@ def own_backbone(rays: Tensor, network: nn.Module | str, **common: Any) -> Backb
             f"its network is a {network}, a module of its user: give backbone={network}(...) to "
             "load_from_checkpoint, r2flow.load or a stage with this parent."
         )
-    return network if isinstance(network, Backbone) else OwnNetwork(rays, network, **common)
+    return network if isinstance(network, Backbone) else ModuleBackbone(rays, network, **common)
