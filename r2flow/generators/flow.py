@@ -10,6 +10,7 @@ from torch import Tensor
 from r2flow.backbones import BACKBONES
 from r2flow.base.errors import InputError
 from r2flow.base.noise import Draws
+from r2flow.base.registry import Config
 from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.solvers import Solution, Velocity, solve
 from r2flow.generators.base import Condition, Generator
@@ -92,7 +93,9 @@ class NetworkFlow(Flow):
     def __init__(self, space: ModelSpace, backbone: Mapping[str, Any]) -> None:
         super().__init__(space)
         channels = space.shape[0]
-        times = {"second_time": True} if self.second_time else {}  # a plug-in may have one only
+        times: Config = (
+            {"second_time": True} if self.second_time else {}
+        )  # a plug-in may have one only
         self.backbone = BACKBONES.build(
             backbone,
             space.rays,

@@ -218,9 +218,9 @@ def cars(s: Returns) -> ndarray:
     np.add.at(mean, label, distance / count[label, None])
     turn = mean.argmin(1)
     on_face = distance[np.arange(len(at)), turn[label]] <= 0.3
-    cars = np.arange(len(number))
-    low = low[cars, :, turn]
-    high = high[cars, :, turn]
+    each = np.arange(len(number))
+    low = low[each, :, turn]
+    high = high[each, :, turn]
     width, length = np.sort(high - low, 1).T
     middle = (low + high) @ [0.5, 0.5j] * np.exp(1j * _TURNS[turn])
     columns = np.unique(label * s.sensor.columns + s.column[at]) // s.sensor.columns
