@@ -103,9 +103,8 @@ def write_stores(folder: Path, beside: Path) -> None:
     write_sensor(replace(SENSORS["vlp16"], name="mine"), beside / "mine.yaml", "of a test")
     keep(folder, "sensor", beside / "mine.yaml")
     columns = {"x": np.arange(4.0), "d": np.arange(4)}
-    for protocol in (3, 5):
-        (beside / f"{protocol}.pkl").write_bytes(table(columns, protocol))
-        keep(folder, "table", beside / f"{protocol}.pkl")
+    (beside / "0.pkl").write_bytes(table(columns))
+    keep(folder, "table", beside / "0.pkl")
 
 
 def write_weights(folder: Path, beside: Path, run: Path) -> None:

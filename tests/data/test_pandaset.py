@@ -1,4 +1,4 @@
-"""PandaSet: tables pickled in the old and the new form become scans in the laser's own frame."""
+"""PandaSet: pickled tables become scans in the laser's own frame."""
 
 import gzip
 import io
@@ -58,8 +58,8 @@ def pickled(obj: object, protocol: int = 4) -> bytes:
     return file.getvalue()
 
 
-def table(columns: dict[str, np.ndarray], protocol: int = 3) -> bytes:
-    """As pandas 1.0 pickles a table in protocol 3, and as pandas 2 does in 4 and 5."""
+def table(columns: dict[str, np.ndarray]) -> bytes:
+    """As pandas 1.0 pickles a table."""
     names = np.array([*columns], dtype=object)
     data = {"data": names, "name": None}
     base = "pandas.core.indexes.base"
@@ -71,16 +71,11 @@ def table(columns: dict[str, np.ndarray], protocol: int = 3) -> bytes:
         values = np.stack([columns[names[place]] for place in places])
         even = Call("builtins slice", (places[0], places[-1] + 1, 1))
         parts.append((values, even if len(places) > 1 else np.array(places)))
-    if protocol == 3:
-        blocks = [{"values": values, "mgr_locs": places} for values, places in parts]
-        state = ([index], [], [], {"0.14.1": {"axes": [index], "blocks": blocks}})
-        manager = Call("pandas.core.internals.managers BlockManager", (), state)
-        held = {"_data": manager}
-    else:
-        made = [Call("pandas._libs.internals _unpickle_block", (*part, 2)) for part in parts]
-        args = (tuple(made), [index])
-        held = {"_mgr": Call("pandas.core.internals.managers BlockManager", args)}
-    return pickled(Call("pandas.core.frame DataFrame", (), {**held, "_typ": "dataframe"}), protocol)
+    blocks = [{"values": values, "mgr_locs": places} for values, places in parts]
+    state = ([index], [], [], {"0.14.1": {"axes": [index], "blocks": blocks}})
+    manager = Call("pandas.core.internals.managers BlockManager", (), state)
+    held = {"_data": manager, "_typ": "dataframe"}
+    return pickled(Call("pandas.core.frame DataFrame", (), held), 3)
 
 
 def scanned(rocking: float, ahead: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -106,19 +101,17 @@ def scanned(rocking: float, ahead: float) -> tuple[np.ndarray, np.ndarray, np.nd
     return laser.T, STAMPS[0] + time, pose.apply(vehicle) + time[:, None] * SPEED + [40, -7, 3]
 
 
-def write_drive(
-    folder: Path, rocking: float = 0.0, ahead: float = 0.0, protocol: int = 3
-) -> np.ndarray:
+def write_drive(folder: Path, rocking: float = 0.0, ahead: float = 0.0) -> np.ndarray:
     """One frame, 01.pkl.gz, with labels; returns its points in the laser's frame."""
     laser, times, world = scanned(rocking, ahead)
     forward = np.arange(len(world)) % 5 == 4  # every 5th point is of the other sensor
     columns = dict(zip("xyz", world.T, strict=True), i=np.arange(len(world)) % 256.0, t=times)
     (folder / "lidar").mkdir(parents=True)
     (folder / "annotations/semseg").mkdir(parents=True)
-    frame = gzip.compress(table({**columns, "d": forward.astype(int)}, protocol), 1)
+    frame = gzip.compress(table({**columns, "d": forward.astype(int)}), 1)
     (folder / "lidar/01.pkl.gz").write_bytes(frame)
     classes = np.where(world[:, 2] > 3, 13, 7)
-    labels = gzip.compress(table({"class": classes}, protocol), 1)
+    labels = gzip.compress(table({"class": classes}), 1)
     (folder / "annotations/semseg/01.pkl.gz").write_bytes(labels)
     poses = []
     for time in STAMPS - STAMPS[0]:
@@ -131,9 +124,8 @@ def write_drive(
     return laser[~forward]
 
 
-@pytest.mark.parametrize("protocol", [3, 4, 5])
-def test_points_are_those_that_the_laser_measured(tmp_path: Path, protocol: int):
-    laser = write_drive(tmp_path / "002", protocol=protocol)
+def test_points_are_those_that_the_laser_measured(tmp_path: Path):
+    laser = write_drive(tmp_path / "002")
     points = read_points(tmp_path / "002/lidar/01.pkl.gz")
     np.testing.assert_allclose(points.xyz, laser, atol=0.005)
     assert points.reflectance.max() == 255
@@ -151,7 +143,7 @@ def test_a_rocking_vehicle_or_another_mount_is_corrected_by_the_beams(
 
 def test_drives_splits_and_labels(tmp_path: Path):
     laser = write_drive(tmp_path / "002")
-    write_drive(tmp_path / "115", protocol=4)
+    write_drive(tmp_path / "115")
     assert [drive.name for drive in find_drives("pandaset", tmp_path)] == ["002", "115"]
     assert [drive.name for drive in find_drives("pandaset", tmp_path, "train")] == ["002"]
     assert [drive.name for drive in find_drives("pandaset", tmp_path, "test")] == ["115"]

@@ -16,7 +16,6 @@ from r2flow.base.errors import InputError, check
 LARGEST_TABLE = 1 << 28  # bytes unpacked; a frame of PandaSet has 8 MB
 MOST_STEPS = 10_000  # of a pickle; a table has some hundreds
 TABLES = ("pandas", "numpy")  # packages whose names a table holds
-OTHERS = {"builtins.slice", "__builtin__.slice", "_codecs.encode"}
 
 
 class _Named:
@@ -39,7 +38,7 @@ class _Named:
 
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> type[_Named]:
-        if module.partition(".")[0] not in TABLES and f"{module}.{name}" not in OTHERS:
+        if module.partition(".")[0] not in TABLES and name != "slice":
             raise InputError(f"it names {module}.{name}, which is no part of a table. Is it safe?")
         return type(name, (_Named,), {})
 
@@ -48,7 +47,8 @@ def read_table(path: Path) -> dict[str, ndarray]:
     """The columns of numbers of a pickled `pandas.DataFrame`, as is or compressed by gzip.
 
     Every class and function that the pickle names becomes a `_Named`, which records how it was
-    called; the arrays are built from these records. Pickles of pandas 0.25 to 3 are known.
+    called; the arrays are built from these records. Tables of pandas 0.25 to 1.2 are known, as
+    PandaSet's.
 
     Raises:
         InputError: It names other packages than pandas and numpy, is too large, or is no table.
@@ -70,45 +70,32 @@ def _columns(frame: Any) -> dict[str, ndarray]:
     held = frame.state if _name(frame) == "DataFrame" else None
     if not isinstance(held, dict):
         raise InputError(f"it holds a {_name(frame)}, not a table.")
-    manager: Any = held.get("_mgr", held.get("_data"))
-    if manager.args:  # pandas 1.3 and later
-        blocks, axes = manager.args
-        pairs = [block.args[:2] for block in blocks]
-    else:
-        stored = manager.state[3]["0.14.1"]
-        axes = stored["axes"]
-        pairs = [(block["values"], block["mgr_locs"]) for block in stored["blocks"]]
-    names = _values(axes[0].args[1]["data"])
+    state = held["_data"].state if "_data" in held else None
+    if not isinstance(state, tuple):
+        raise InputError("it is a table of pandas 1.3 or later; PandaSet's are of pandas 1.0.")
+    stored = state[3]["0.14.1"]
+    names = _values(stored["axes"][0].args[1]["data"])
     columns = {}
-    for values, places in pairs:
-        numbers = _values(values)
+    for block in stored["blocks"]:
+        numbers = _values(block["values"])
         if not isinstance(numbers, ndarray) or numbers.dtype.kind not in "fiub":
             continue
+        places = block["mgr_locs"]
         whole = range(len(names))
-        chosen = whole[slice(*places.args)] if _name(places) == "slice" else _values(places)
-        for place, column in zip(chosen, numbers, strict=True):
+        numbered = whole[slice(*places.args)] if _name(places) == "slice" else _values(places)
+        for place, column in zip(numbered, numbers, strict=True):
             columns[str(names[place])] = column
     return columns
 
 
 def _values(made: Any) -> ndarray | Sequence[Any]:
     """The values of a recorded array; those of an array of objects as a list."""
-    name = _name(made)
-    if name == "__pyx_unpickle_NDArrayBacked":  # pandas 3: strings
-        return _values(made.state[1])
-    if name == "_frombuffer":
-        buffer, kind, shape, order = made.args
-    else:
-        check(name == "_reconstruct", f"it holds a {name}, not an array.")
-        _, shape, kind, columns_first, buffer = made.state
-        order = "F" if columns_first else "C"
+    check(_name(made) == "_reconstruct", f"it holds a {_name(made)}, not an array.")
+    _, shape, kind, columns_first, buffer = made.state
     if isinstance(buffer, list):
         return buffer
-    if _name(buffer) == "encode":
-        buffer = buffer.args[0].encode("latin1")
-    order_of_bytes = kind.state[1] if kind.state else "="
-    dtype = np.dtype(kind.args[0]).newbyteorder(order_of_bytes)
-    return np.frombuffer(buffer, dtype).reshape(shape, order=order)
+    dtype = np.dtype(kind.args[0]).newbyteorder(kind.state[1])
+    return np.frombuffer(buffer, dtype).reshape(shape, order="F" if columns_first else "C")
 
 
 def _name(made: Any) -> str:
