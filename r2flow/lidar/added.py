@@ -24,7 +24,7 @@ OfRays = Mapping[str, tuple[ndarray, float]]
 
 
 def completed_cloud(
-    given: Partial, image: ndarray, sensor: Sensor, of_rays: OfRays | None = None
+    scan: Partial, image: ndarray, sensor: Sensor, of_rays: OfRays | None = None
 ) -> Cloud:
     """The measured points of a scan, unchanged and in their order, and then the added points.
 
@@ -35,30 +35,30 @@ def completed_cloud(
     `of_rays`, float32.
 
     Args:
-        given: The scan as the model saw it, with its points and their cloud.
+        scan: The scan as the model saw it, with its points and their cloud.
         image: An answer: range in metres, reflectance in [0, 1] if the model has it, (1 or more, H,
             W).
     """
-    points = given.points
+    points = scan.points
     assert points is not None
     assert points.cloud is not None
     assert points.kept is not None
-    assert given.row is not None
+    assert scan.row is not None
     of_rays = of_rays or {}
     cloud = points.cloud.take(points.kept)
     rows, columns = sensor.shape
     row_of_ray = np.repeat(np.arange(rows, dtype=np.float32)[:, None], columns, axis=1)
     strength = image[1] if len(image) > 1 else np.zeros_like(image[0])
     channels = [image[0], strength, row_of_ray, *(values for values, _ in of_rays.values())]
-    added = np.stack(channels) * (given.state != Ray.RETURN)
+    added = np.stack(channels) * (scan.state != Ray.RETURN)
     xyz, (strength, row, *trust) = image_points(added.astype(np.float32), sensor)
     nothing = np.zeros(len(xyz))
     ring = cloud.column("ring")
     silent = points.reflectance is None or not points.reflectance.any()
     values = dict(zip("xyz", xyz.T, strict=True)) | {
         "ring": row if ring is not None and ring.any() else nothing,
-        "reflectance": nothing if silent else strength * given.scale,
-        "time": _times(given, cloud, xyz, row),
+        "reflectance": nothing if silent else strength * scan.scale,
+        "time": _times(scan, cloud, xyz, row),
     }
     roles = {cloud.place(role): role for role in values}
     new = [
@@ -78,24 +78,24 @@ def completed_cloud(
     measured = len(cloud)
     more: dict[str, ndarray] = {
         MEASURED: np.repeat(np.array([1, 0], np.uint8), [measured, len(xyz)]),
-        ROW: np.concatenate([np.where(given.row < 0, NO_ROW, given.row), row]).astype(np.uint16),
+        ROW: np.concatenate([np.where(scan.row < 0, NO_ROW, scan.row), row]).astype(np.uint16),
     }
     for (name, (_, of_measured)), of_added in zip(of_rays.items(), trust, strict=True):
         more[name] = np.concatenate([np.full(measured, of_measured, np.float32), of_added])
     return whole.with_fields(more)
 
 
-def _times(given: Partial, cloud: Cloud, xyz: ndarray, row: ndarray) -> ndarray:
+def _times(scan: Partial, cloud: Cloud, xyz: ndarray, row: ndarray) -> ndarray:
     """Times of added points, (K,), in the type of the cloud's; 0 if these are 0 throughout."""
     time = cloud.column("time")
     if time is None or not time.any() or not len(xyz):
         return np.zeros(len(xyz))
-    assert given.points is not None
-    assert given.row is not None
-    azimuth = np.arctan2(*given.points.xyz.T[1::-1].astype(float))
+    assert scan.points is not None
+    assert scan.row is not None
+    azimuth = np.arctan2(*scan.points.xyz.T[1::-1].astype(float))
     asked = np.arctan2(*xyz.T[1::-1].astype(float))
     name = cloud.names[cloud.place("time") or 0]
-    return times_of(time, given.row, azimuth, row.astype(int), asked, name)
+    return times_of(time, scan.row, azimuth, row.astype(int), asked, name)
 
 
 def unknown_fields(cloud: Cloud) -> list[str]:

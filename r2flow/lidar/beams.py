@@ -215,8 +215,8 @@ def _beams_of_elevations(elevation: ndarray) -> Beams | None:
         peaks = np.flatnonzero((before < here) & (here >= after)) + 1
         heights = smooth[peaks]
         # Returns from the vehicle itself have scattered elevations.
-        usual = np.median(heights[heights > 0.01 * heights.max()])
-        peaks_of.append(edges[peaks[heights > FAINT * usual]] + BIN / 2)
+        typical = np.median(heights[heights > 0.01 * heights.max()])
+        peaks_of.append(edges[peaks[heights > FAINT * typical]] + BIN / 2)
     runs = [[*run] for count, run in groupby(peaks_of, len) if FEWEST <= count <= MOST]
     # The finest: wider ones merge weak beams with strong neighbours.
     stable = next((run for run in runs if len(run) >= STABLE), None)

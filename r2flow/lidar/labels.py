@@ -97,10 +97,10 @@ class LabelList:
         else the first id of the class, else one without a class.
         """
         numbers: list[int] = []
-        for number, usual in enumerate(_IDS):
-            of_class = [own for own, id in self.ids if _COMMON[id] == number]
-            same = [own for own, id in self.ids if id == usual]
-            numbers.append(next(iter([*same, *of_class, *numbers[:1], 0])))
+        for common, standing in enumerate(_IDS):
+            same = [number for number, id in self.ids if id == standing]
+            of_class = [number for number, id in self.ids if _COMMON[id] == common]
+            numbers.append([*same, *of_class, *numbers[:1], 0][0])
         return np.array(numbers, np.uint32)[classes.astype(np.uint8)]
 
 
@@ -108,37 +108,34 @@ def _names() -> list[str]:
     return sorted(path.stem for path in _LISTS.glob("*.yaml"))
 
 
-def label_list(given: "str | Mapping[Any, Any] | LabelList") -> LabelList:
+def label_list(source: "str | Mapping[Any, Any] | LabelList") -> LabelList:
     """A list of ids: a name in `label_lists`, a YAML file, or the map of ids itself, to
     SemanticKITTI's names or ids. In a file the map may be that of the key `labels`.
 
     Raises:
         InputError: There is no such list, or it maps to no class of SemanticKITTI.
     """
-    if isinstance(given, LabelList):
-        return given
-    entries = given
+    if isinstance(source, LabelList):
+        return source
+    entries = source
     name = "the list given"
-    if isinstance(given, str):
-        name = given
-        file = Path(given).expanduser()
+    if isinstance(source, str):
+        name = source
+        file = Path(source).expanduser()
         if file.suffix.lower() not in (".yaml", ".yml"):
             known = ", ".join(_names())
-            check(given in _names(), f"no list of ids named {quoted(given)}; known: {known}.")
-            file = _LISTS / f"{given}.yaml"
+            check(source in _names(), f"no list of ids named {quoted(source)}; known: {known}.")
+            file = _LISTS / f"{source}.yaml"
         with reading(file, 1 << 20, "list of ids"):
             entries = parse_yaml(file.read_text(encoding="utf-8"))
     with naming(name):
         lines = entries.get("labels", entries) if isinstance(entries, Mapping) else None
         if not lines or not isinstance(lines, Mapping):
             raise InputError("it is not a list of ids: give lines such as `1: car`.")
-        ids = [(_whole(number), _semantic_id(named)) for number, named in lines.items()]
+        for number in lines:
+            check(str(number).isdecimal(), f"an id is a whole number; found {quoted(number)}.")
+        ids = [(int(number), _semantic_id(named)) for number, named in lines.items()]
     return LabelList(name, tuple(ids))
-
-
-def _whole(number: Any) -> int:
-    check(str(number).isdecimal(), f"an id is a whole number; found {quoted(number)}.")
-    return int(number)
 
 
 def _semantic_id(named: Any) -> int:

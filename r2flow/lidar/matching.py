@@ -111,12 +111,11 @@ def is_tilted(scans: Sequence[Points]) -> bool:
     elevation = 110 + elevations_of(xyz)
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
     ahead = np.stack([np.cos(azimuth), np.sin(azimuth)])
-    clear = {}
-    for tilt in product(TILTS, TILTS):
-        count = np.bincount(((elevation - tilt @ ahead) / 0.05).astype(int))
-        clear[tilt] = (np.convolve(count, np.ones(5)) ** 2).sum()
-    level = max(value for tilt, value in clear.items() if max(map(abs, tilt)) <= LEVEL)
-    return bool(max(clear.values()) > CLEARER * level)
+    tilts = np.array([*product(TILTS, TILTS)])
+    bins = [((elevation - tilt @ ahead) / 0.05).astype(int) for tilt in tilts]
+    clear = np.array([(np.convolve(np.bincount(one), np.ones(5)) ** 2).sum() for one in bins])
+    level = clear[abs(tilts).max(axis=1) <= LEVEL].max()
+    return bool(clear.max() > CLEARER * level)
 
 
 def is_unclear(scans: Sequence[Points]) -> bool:

@@ -51,10 +51,10 @@ class Partial:
     scale: float = 1.0  # value of full reflectance in the file
 
 
-def gaps_unknown(given: Partial) -> Partial:
+def gaps_unknown(scan: Partial) -> Partial:
     """A partial scan whose rays without a return count as not measured."""
-    state = np.where(given.state == Ray.EMPTY, np.uint8(Ray.UNKNOWN), given.state)
-    return replace(given, state=state)
+    state = np.where(scan.state == Ray.EMPTY, np.uint8(Ray.UNKNOWN), scan.state)
+    return replace(scan, state=state)
 
 
 def sensor_of(scans: list[Points], named: Sensor | None) -> Sensor:
@@ -106,14 +106,14 @@ def points_through(
     if not all_stored or stored < WHOLE * math.prod(source.shape):
         blind = _blind(azimuth[beam >= 0], target.columns, source.columns)
         empty[:, blind] = False
-    chosen = np.flatnonzero((beam >= 0) & (row[beam] >= 0))
-    pixel = row[beam[chosen]] * target.columns + _columns(azimuth[chosen], target.columns)
+    inside = np.flatnonzero((beam >= 0) & (row[beam] >= 0))
+    pixel = row[beam[inside]] * target.columns + _columns(azimuth[inside], target.columns)
     if reflectance is not None:
-        reflectance = reflectance[chosen]
-    seen = _cast(target, xyz[chosen], pixel, empty, reflectance)
+        reflectance = reflectance[inside]
+    seen = _cast(target, xyz[inside], pixel, empty, reflectance)
     assert seen.place is not None
     # Without a point in view there is no number to look up.
-    place = np.where(seen.place < 0, -1, chosen[seen.place]) if len(chosen) else seen.place
+    place = np.where(seen.place < 0, -1, inside[seen.place]) if len(inside) else seen.place
     rows = np.where(beam >= 0, row[beam], rows_of(elevation, target))
     return replace(seen, row=rows, place=place)
 
@@ -151,8 +151,8 @@ def points_of_same(
     the minimum range.
     """
     xyz = points.xyz
-    hit, chosen, r = project_indices(xyz, target, projection, convention, points.ring)
-    values = [r] if reflectance is None else [r, reflectance[chosen]]
+    hit, point, r = project_indices(xyz, target, projection, convention, points.ring)
+    values = [r] if reflectance is None else [r, reflectance[point]]
     image = scatter(target, hit, values)
     state = _state_of(image[0] > 0)
     # A point at the origin is a ray without a return.
@@ -169,8 +169,8 @@ def points_of_same(
         row = unfolded_rows(xyz, target, convention, points.ring)
     else:
         row = rows_of(elevations_of(xyz), target)
-    measured = scatter(target, hit, xyz[chosen].T)
-    return Partial(image, state, measured, row=row, place=_places(target, hit, chosen))
+    measured = scatter(target, hit, xyz[point].T)
+    return Partial(image, state, measured, row=row, place=_places(target, hit, point))
 
 
 def image_of_same(image: ndarray, target: Sensor) -> Partial:
@@ -201,23 +201,21 @@ def _cast(
     r = np.linalg.norm(xyz, axis=1).astype(np.float32)
     near = r < target.min_range
     far = r > target.max_range
-    hit, chosen = nearest(np.where(near | far, empty.size, pixel), r, empty.size)
+    hit, point = nearest(np.where(near | far, empty.size, pixel), r, empty.size)
     state = np.where(empty, np.uint8(Ray.EMPTY), np.uint8(Ray.UNKNOWN))
     rays = state.ravel()
     rays[pixel[far]] = Ray.EMPTY
     rays[pixel[near]] = Ray.UNKNOWN
     rays[hit] = Ray.RETURN
-    values = [r[chosen]] if reflectance is None else [r[chosen], reflectance[chosen]]
-    measured = scatter(target, hit, xyz[chosen].T)
-    return Partial(
-        scatter(target, hit, values), state, measured, place=_places(target, hit, chosen)
-    )
+    values = [r[point]] if reflectance is None else [r[point], reflectance[point]]
+    measured = scatter(target, hit, xyz[point].T)
+    return Partial(scatter(target, hit, values), state, measured, place=_places(target, hit, point))
 
 
-def _places(target: Sensor, pixel: ndarray, chosen: ndarray) -> ndarray:
+def _places(target: Sensor, pixel: ndarray, point: ndarray) -> ndarray:
     """The number of the point of each pixel, (H, W); -1 without one."""
     place = np.full(target.shape, -1)
-    place.ravel()[pixel] = chosen
+    place.ravel()[pixel] = point
     return place
 
 

@@ -166,7 +166,7 @@ def _serialized(message: Any, cloud: Cloud, encoding: str) -> bytes:
 
 def _laid_out(rows: ndarray, message: Any) -> ndarray:
     """Rows whose fields have the message's offsets; others follow, aligned to their own size."""
-    own = {field.name: field.offset for field in message.fields}
+    placed = {field.name: field.offset for field in message.fields}
     step = message.point_step
     offsets = {}
     for name in rows.dtype.names or ():
@@ -177,7 +177,7 @@ def _laid_out(rows: ndarray, message: Any) -> ndarray:
                 f"a PointCloud2 cannot hold the field {name} of {kind}, but integers of 1, 2 and "
                 "4 bytes and floats of 4 and 8."
             )
-        offsets[name] = own.get(name, -(-step // kind.base.itemsize) * kind.base.itemsize)
+        offsets[name] = placed.get(name, -(-step // kind.base.itemsize) * kind.base.itemsize)
         step = max(step, offsets[name] + kind.itemsize)
     names = sorted(offsets, key=lambda name: offsets[name])
     layout = np.dtype(

@@ -63,8 +63,8 @@ def project(
             sensor's rings.
     """
     sensor = named_sensor(sensor)
-    hit, chosen, r = project_indices(xyz, sensor, projection, convention, ring)
-    strength = np.zeros_like(r) if reflectance is None else reflectance[chosen]
+    hit, point, r = project_indices(xyz, sensor, projection, convention, ring)
+    strength = np.zeros_like(r) if reflectance is None else reflectance[point]
     return scatter(sensor, hit, [r, strength])
 
 
@@ -113,8 +113,8 @@ def project_indices(
         # Omitted points share an extra pixel after the last: faster than removing them from every
         # array.
         pixel[(row < 0) | (row >= rows) | ~within] = pixels
-        hit, chosen = nearest(pixel, r, pixels)
-        return hit, chosen, r[chosen]
+        hit, point = nearest(pixel, r, pixels)
+        return hit, point, r[point]
     if convention == "lidm":
         within = (r > sensor.min_range) & (r < sensor.max_range)
         finite = within

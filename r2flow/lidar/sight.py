@@ -199,10 +199,10 @@ def _rays(azimuth: Tensor, beam: Tensor, beams: int, steps: Tensor) -> tuple[Ten
     before = torch.zeros_like(number).scatter(0, after, number)
     three = gap + gap[before] + gap[after]
     missing = torch.minimum((gap / step).round() - 1, (three / step).round() - 3)
-    own = missing.clamp(min=0).long() + 1
-    start = own.cumsum(0) - own
-    total: Any = own.sum().item()  # in an export a symbol, which int() would fix
+    rays = missing.clamp(min=0).long() + 1
+    start = rays.cumsum(0) - rays
+    total: Any = rays.sum().item()  # in an export a symbol, which int() would fix
     marks = number.new_zeros(total).scatter(0, start, torch.ones_like(start))
     which = marks.cumsum(0) - 1
     k = torch.arange(total, device=beam.device) - start[which]
-    return azimuth[which] + (gap / own)[which] * k, beam[which]
+    return azimuth[which] + (gap / rays)[which] * k, beam[which]

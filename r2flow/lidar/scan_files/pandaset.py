@@ -120,10 +120,10 @@ def _aligned(xyz: ndarray, times: ndarray) -> ndarray:
     near = np.maximum(1 - abs(times[:, None] - knots) / (knots[1] - knots[0]), 0)
     distance = np.linalg.norm(xyz, axis=1)
     far = np.flatnonzero((distance > VEHICLE) & (distance < np.inf))
-    chosen = far[np.linspace(0, len(far) - 1, min(FITTED, len(far))).astype(int)]
+    sample = far[np.linspace(0, len(far) - 1, min(FITTED, len(far))).astype(int)]
     fitted = np.zeros(len(PRIOR))
     for scale in SCALES:
-        x, y, z = _moved(xyz[chosen], near[chosen], fitted).T
+        x, y, z = _moved(xyz[sample], near[sample], fitted).T
         level = np.hypot(x, y).clip(1e-3)
         elevation = np.arctan2(z, level)
         beam = np.searchsorted(between, elevation)
@@ -133,7 +133,7 @@ def _aligned(xyz: ndarray, times: ndarray) -> ndarray:
         sin = y / level
         square = level**2 + z**2
         each = [sin, -cos, z * cos / square, z * sin / square, -level / square]
-        slopes = np.hstack([slope[:, None] * near[chosen] for slope in each])
+        slopes = np.hstack([slope[:, None] * near[sample] for slope in each])
         weighted = slopes.T * weight
         prior = (scale / PRIOR) ** 2
         fitted += np.linalg.solve(

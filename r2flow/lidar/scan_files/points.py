@@ -141,11 +141,11 @@ def renamed(names: Sequence[str], columns: Sequence[str] | None) -> list[str]:
             "--columns intensities=reflectance."
         )
     pairs = [str(name).rpartition("=") for name in columns]
-    given = {_plain(field.strip()): role.strip() for field, _, role in pairs}
+    roles = {_plain(field.strip()): role.strip() for field, _, role in pairs}
     plain = [_plain(name) for name in names]
-    _refuse_missing([field for field in given if field not in plain], names)
-    taken = {role_of(role) for role in given.values()} - {None}
-    return [given.get(name, "_" if role_of(name) in taken else name) for name in plain]
+    _refuse_missing([field for field in roles if field not in plain], names)
+    taken = {role_of(role) for role in roles.values()} - {None}
+    return [roles.get(name, "_" if role_of(name) in taken else name) for name in plain]
 
 
 def _refuse_missing(missing: Sequence[str], names: Sequence[str]) -> None:
