@@ -21,6 +21,7 @@ from r2flow.metrics.scans import Scans
 _NEAR = 1.0  # metres, as all lengths here
 _FAR = 56.0
 _EXTENT = 50
+_METRES = [-_EXTENT, _EXTENT]
 FINE = 0.05  # cell size of JSD
 COARSE = 0.5  # cell size of MMD
 
@@ -46,7 +47,7 @@ class JSDLiDM(JSD):
     mask = (_NEAR, _FAR)
     settings: ClassVar = {
         "cell": FINE,
-        "metres": [-_EXTENT, _EXTENT],
+        "metres": _METRES,
         "logarithm": "natural",
         "root": True,
     }
@@ -79,7 +80,7 @@ class MMDLiDM(StoredMetric):
     mask = (_NEAR, _FAR)
     settings: ClassVar = {
         "cell": COARSE,
-        "metres": [-_EXTENT, _EXTENT],
+        "metres": _METRES,
         "distance": "Chamfer, squared, halved",
     }
     biased = True

@@ -29,8 +29,8 @@ def _read_gan(content: Any, path: Path, averaged: bool = True) -> Published:
     dataset = cfg["dataset"]
     model = cfg["model"]["generator"]
     synthesis = model["synthesis_kwargs"]
-    shape = tuple(map(int, synthesis["resolution"]))
-    if tuple(angle.shape) != (1, 2, *shape):
+    shape = synthesis["resolution"]
+    if [*angle.shape] != [1, 2, *shape]:
         raise ValueError(f"the angles, which are {tuple(angle.shape)}, of images of {shape}")
     image = next(output for output in synthesis["out_ch"] if output["name"] == "image")
     generator = _generator(model)
@@ -45,7 +45,7 @@ def _read_gan(content: Any, path: Path, averaged: bool = True) -> Published:
         "generator": generator,
         "backbone": None,
         "data": {
-            "name": str(dataset["name"]),
+            "name": dataset["name"],
             "reading": {"projection": "unfolding", "convention": "reference"},
         },
         "published": cfg,
@@ -55,22 +55,22 @@ def _read_gan(content: Any, path: Path, averaged: bool = True) -> Published:
 
 
 def _generator(model: Options) -> Config:
-    name = _GENERATORS[str(model["arch"])]
+    name = _GENERATORS[model["arch"]]
     mapping = model["mapping_kwargs"]
     synthesis = model["synthesis_kwargs"]
     options = {
         "name": name,
-        "latent": int(mapping["in_ch"]),
-        "base_channels": int(synthesis["ch_base"]),
-        "max_channels": int(synthesis["ch_max"]),
+        "latent": mapping["in_ch"],
+        "base_channels": synthesis["ch_base"],
+        "max_channels": synthesis["ch_max"],
     }
     if name != "vanilla_gan":
         measurement = model["measurement_kwargs"]
-        options["temperature"] = float(measurement["gumbel_temperature"])
+        options["temperature"] = measurement["gumbel_temperature"]
         synthesis = {**synthesis, **measurement}
     if name == "dusty2":
-        options["code"] = int(mapping["out_ch"])
-        options["depth"] = int(mapping["depth"])
+        options["code"] = mapping["out_ch"]
+        options["depth"] = mapping["depth"]
         options["doublings"] = len(synthesis["layers"])
     for key, value in _FORM.items():
         if synthesis.get(key, value) != value:

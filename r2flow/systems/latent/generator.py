@@ -21,7 +21,9 @@ from r2flow.systems.latent.unet import LatentUNet
 class _Latent(Generator):
     """A generator with an autoencoder, whose noise has the shape of the latents."""
 
-    def __init__(self, space: ModelSpace, autoencoder: Options | None) -> None:
+    def __init__(
+        self, space: ModelSpace, backbone: Options | None, autoencoder: Options | None = None
+    ) -> None:
         super().__init__(space)
         self.first_stage_model = construct(
             "generator.autoencoder", Autoencoder, autoencoder, space.shape[0]
@@ -37,11 +39,6 @@ class VQAutoencoder(_Latent):
     """
 
     unconditional = False
-
-    def __init__(
-        self, space: ModelSpace, backbone: Options | None, autoencoder: Options | None = None
-    ) -> None:
-        super().__init__(space, autoencoder)
 
 
 class LatentDiffusion(_Latent):
@@ -66,7 +63,7 @@ class LatentDiffusion(_Latent):
         unet: Options | None = None,
         schedule: Options | None = None,
     ) -> None:
-        super().__init__(space, autoencoder)
+        super().__init__(space, backbone, autoencoder)
         self.run_by(LatentDDIM())
         with torch.device("cpu"):
             log_snr = DISCRETE.build(schedule or {"name": "square_root_linear"})

@@ -96,7 +96,7 @@ def _read_diffusion(content: Any, path: Path, averaged: bool = True) -> Publishe
             "steps": len(betas),
         },
     }
-    generator["unet"]["head_channels"] = int(unet.get("num_head_channels", _HEAD))
+    generator["unet"]["head_channels"] = unet.get("num_head_channels", _HEAD)
     weights = {name: state[name] for name in state if name.startswith((_UNET, _AUTOENCODER))}
     return Published(_config(generator, path, notes), weights, int(content.get("global_step", 0)))
 
@@ -193,11 +193,11 @@ def _config(generator: Config, path: Path, notes: Options) -> Config:
     found = ((notes.get("data") or {}).get("params") or {}).get("dataset") or {}
     images: Config = {**_IMAGES, **found}
     rows, columns = images["size"]
-    nearest, farthest = map(float, images["depth_range"])
+    nearest, farthest = images["depth_range"]
     sensor = {
         "name": "hdl64e",
-        "rows": int(rows),
-        "columns": int(columns),
+        "rows": rows,
+        "columns": columns,
         "min_range": nearest,
         "max_range": farthest,
     }
