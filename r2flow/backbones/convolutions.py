@@ -251,8 +251,9 @@ class UNet(Backbone, ABC):
         first = channel_multiplier[0] if self.multiplied else 1
         widths = [base_channels * n for n in (first, *channel_multiplier)]
         self.in_conv = RingConv2d(inputs, widths[0], ring)
-        options = BlockOptions(width, ring, dropout, groups, eps)
-        self.build_levels(widths, counts, num_heads, options)
+        self.build_levels(
+            widths, counts, num_heads, BlockOptions(width, ring, dropout, groups, eps)
+        )
         if self.second_time:
             self.interval_embedding = time_embedding(base_channels, width, bias=False)
             zero_initialised(self.interval_embedding[-1])

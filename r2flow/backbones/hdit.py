@@ -112,8 +112,7 @@ class HDiT(Backbone):
             ends = (self.in_channels, self.out_channels)
             self.detail = Detail(*detail, ends, base_channels, self.patch, time_channels, ring)
         if self.second_time:
-            last = zero_initialised(ExactLinear(time_channels, time_channels, bias=False))
-            self.interval_embedding = time_embedding(time_channels, dropout).append(last)
+            self.interval_embedding = interval_embedding(time_channels, dropout)
         self.follow_rays()
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:
@@ -172,8 +171,15 @@ class HDiT(Backbone):
 
 def time_embedding(channels: int, dropout: float) -> nn.Sequential:
     """t (B,) to (B, channels): random Fourier features and a mapping network."""
-    features = RandomFourierFeatures(channels)
-    return nn.Sequential(features, mapping_network(channels, ExactLinear, dropout))
+    return nn.Sequential(
+        RandomFourierFeatures(channels), mapping_network(channels, ExactLinear, dropout)
+    )
+
+
+def interval_embedding(channels: int, dropout: float) -> nn.Sequential:
+    """`time_embedding` of s - t with a last layer that is zero at first."""
+    last = zero_initialised(ExactLinear(channels, channels, bias=False))
+    return time_embedding(channels, dropout).append(last)
 
 
 def _position(

@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from r2flow.backbones.base import Backbone
 from r2flow.backbones.encodings import FourierFeatures
-from r2flow.backbones.hdit import RayFeatures, time_embedding
-from r2flow.backbones.layers import ExactLinear, RMSNorm, uncast, unshuffle, zero_initialised
+from r2flow.backbones.hdit import RayFeatures, interval_embedding, time_embedding
+from r2flow.backbones.layers import RMSNorm, uncast, unshuffle, zero_initialised
 from r2flow.backbones.transformer import Block, BlockOptions
 from r2flow.base.registry import Count, Natural, Portion, Size
 
@@ -65,8 +65,7 @@ class ViT(Backbone):
         pixels = nn.Linear(channels, patch_h * patch_w * self.out_channels, bias=False)
         self.detokenizer = nn.Sequential(RMSNorm(channels), zero_initialised(pixels))
         if self.second_time:
-            last = zero_initialised(ExactLinear(time_channels, time_channels, bias=False))
-            self.interval_embedding = time_embedding(time_channels, dropout).append(last)
+            self.interval_embedding = interval_embedding(time_channels, dropout)
         self.follow_rays()
 
     def velocity(self, t: Tensor, x: Tensor, s: Tensor | None = None) -> Tensor:

@@ -54,8 +54,9 @@ class _FeatureMetric(StoredMetric):
     def protocol(self) -> Protocol:
         network = self.extractor
         layer = f"{network.layer}, {network.dim}"
-        protocol = super().protocol
-        return replace(protocol, extractor=network.name, weights=network.weights, layer=layer)
+        return replace(
+            super().protocol, extractor=network.name, weights=network.weights, layer=layer
+        )
 
     def rows(self, scans: Scans) -> Tensor:
         """Features of a batch, (B, D), computed once per network for all metrics."""
@@ -83,8 +84,7 @@ def _frechet_distance(
     a_1 = _root(covariance_1)
     a_2 = _root(covariance_2)
     common = torch.linalg.svdvals(a_1.T @ a_2).sum()
-    shift = (mean_1 - mean_2).square().sum()
-    d = shift + a_1.square().sum() + a_2.square().sum() - 2 * common
+    d = (mean_1 - mean_2).square().sum() + a_1.square().sum() + a_2.square().sum() - 2 * common
     return max(float(d), 0.0)  # rounding may give negative values for equal Gaussians
 
 

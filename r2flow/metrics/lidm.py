@@ -104,6 +104,5 @@ class MMDLiDM(StoredMetric):
                 b = (y == 0).double()
                 to_generated = (a @ y.T) / a.sum(1)[:, None]  # of all pairs, in squared cells
                 to_real = (x @ b.T) / b.sum(1)
-                chamfer = (to_generated + to_real) / 2
-                nearest[i] = torch.minimum(nearest[i], chamfer.amin(1))
+                nearest[i] = torch.minimum(nearest[i], ((to_generated + to_real) / 2).amin(1))
         return [float(nearest.mean()) * (COARSE / (2 * _EXTENT)) ** 2]

@@ -69,8 +69,9 @@ class FixedSteps(OnGrid, ODESampler):
         options = self.options() | {"steps": self.steps - 1}
         near = solve(v, noise, 0.0, t, progress=progress, **options)
         last = solve(v, near.x, t, steps=1, progress=progress)
-        evaluations = near.evaluations + last.evaluations
-        return Generated(last.x, evaluations, near.converged & last.converged)
+        return Generated(
+            last.x, near.evaluations + last.evaluations, near.converged & last.converged
+        )
 
 
 @dataclass(frozen=True)

@@ -69,8 +69,12 @@ def draw_ground(draws: SceneBuilder, kind: Kind) -> Ground:
 def _wave(draws: ScalarDraws, length: float, height: float) -> tuple[float, float, float, float]:
     number = tau / (length * draws.uniform(0.8, 1.25))
     turn = draws.uniform(0, tau)
-    amplitude = height * draws.uniform(0.3, 1.5)
-    return amplitude, number * cos(turn), number * sin(turn), draws.uniform(0, tau)
+    return (
+        height * draws.uniform(0.3, 1.5),
+        number * cos(turn),
+        number * sin(turn),
+        draws.uniform(0, tau),
+    )
 
 
 def _streets(draws: ScalarDraws, kind: Kind) -> tuple[Street, ...]:

@@ -135,9 +135,14 @@ class ObjectBuilder(SceneBuilder):
     def bush(self, pose: Pose, size: float) -> None:
         """A few leafy clumps on the ground."""
         height = self.uniform(0.3, 0.9) * size
-        count = self.whole(4, 7)
         self._clumps(
-            pose, height * 0.8, 0.8 * size, height, 0.38 * size, count, self.uniform(0.15, 0.5)
+            pose,
+            height * 0.8,
+            0.8 * size,
+            height,
+            0.38 * size,
+            self.whole(4, 7),
+            self.uniform(0.15, 0.5),
         )
 
     def thicket(self, pose: Pose) -> None:
@@ -247,8 +252,8 @@ class ObjectBuilder(SceneBuilder):
     def cabinet(self, pose: Pose) -> None:
         site = self.post(pose)
         if site:
-            length = self.uniform(0.6, 1.4)
-            site.box(0, 0, length, 0.4, 0, self.uniform(0.9, 1.4), "other-structure", "concrete")
+            size = self.uniform(0.6, 1.4), 0.4, 0, self.uniform(0.9, 1.4)
+            site.box(0, 0, *size, "other-structure", "concrete")
 
 
 def _axle(

@@ -87,8 +87,7 @@ def _on_solid(
     along, across = rotate(normal.x, normal.y, cos, sin)
     ahead = along + normal.z * slope
     surface = take(surfaces, k)
-    rise = z - surface.base
-    depth = _divide(surface, normal, rise)
+    depth = _divide(surface, normal, z - surface.base)
     hits.cosine[pixel] = np.abs(ahead) / np.sqrt(1 + slope**2)
     hits.label[pixel] = surface.label
     hits.material[pixel] = surface.material

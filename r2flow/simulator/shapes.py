@@ -119,8 +119,7 @@ class Blobs(namedtuple("Blobs", "x y z radius height path")):
         """Roots of |p(s) - c|^2 = 1 in units of the semi-axes; the near root moves inwards by the
         free path.
         """
-        lowest = self.z - self.height
-        solids = row_windows(rays, _chords(self, rays), lowest, self.z + self.height)
+        solids = row_windows(rays, _chords(self, rays), self.z - self.height, self.z + self.height)
         pixel, slope, height, k, _, _, _, middle, half = solids
         at = take(self, k)
         level = 1 / at.radius**2  # (s - middle)^2 level + (z + s T - c)^2 upright = half^2 level
@@ -243,5 +242,5 @@ def _clip(near: Column, far: Column, direction: Any, room: Any) -> tuple[ndarray
         at = room / direction
     near = np.maximum(near, np.where(direction < 0, at, -np.inf).max(0))
     far = np.minimum(far, np.where(direction > 0, at, np.inf).min(0))
-    outside = (direction == 0) & (room < 0)
-    return near, np.where(outside.any(0), -np.inf, far)
+    outside = ((direction == 0) & (room < 0)).any(0)
+    return near, np.where(outside, -np.inf, far)

@@ -37,7 +37,7 @@ class EmbeddedMethod:
         """Solve every scene of x, (B, ...), from the first time to the last with its own steps."""
         from r2flow.flow.solvers.adaptive import advance
 
-        return v.solution(advance(v, x, float(times[0]), float(times[-1]), self))
+        return v.solution(advance(v, x, *times.tolist(), self))
 
     @property
     def distinct(self) -> dict[float, int]:

@@ -39,7 +39,7 @@ class ExponentialMethod:
         ends = []
         for place, start in enumerate(x):
             v.only(np.array([place]))
-            scene = _Scene(v, start, float(times[0]), float(times[-1]))
+            scene = _Scene(v, start, *times.tolist())
             v.converged[place] = scene.solve()
             ends.append(scene.u.view(start.shape))
         return v.solution(torch.stack(ends))

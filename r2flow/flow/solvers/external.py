@@ -34,10 +34,8 @@ class TorchDiffEqMethod:
     def _solver(self) -> Any:
         from torchdiffeq._impl.odeint import SOLVERS
 
-        names = SOLVERS.keys() - _LEFT_OUT
-        return Registry("method of torchdiffeq", **{name: SOLVERS[name] for name in names})[
-            self.name
-        ]
+        known = {name: SOLVERS[name] for name in SOLVERS.keys() - _LEFT_OUT}
+        return Registry("method of torchdiffeq", **known)[self.name]
 
     @property
     def adapts(self) -> bool:

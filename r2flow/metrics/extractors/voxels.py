@@ -201,5 +201,4 @@ def _exchange(points: Tensor, coords: Tensor, voxels: Sparse, scale: int) -> tup
     )
     index = grid.find(home)
     total = points.new_zeros(len(grid), points.shape[1]).index_add_(0, index, points)
-    count = torch.bincount(index, minlength=len(grid))
-    return points, Sparse(total / count[:, None], grid)
+    return points, Sparse(total / torch.bincount(index, minlength=len(grid))[:, None], grid)

@@ -116,8 +116,9 @@ class Diffusion(NetworkFlow):
             progress()
             return self.denoise(z, log_snr)
 
-        log_snrs = self.log_snrs(how, z)
-        *_, z = repaint(denoise, z, image, known, log_snrs, noise, how.repeats, how.jump)
+        *_, z = repaint(
+            denoise, z, image, known, self.log_snrs(how, z), noise, how.repeats, how.jump
+        )
         return self._clipped(z)
 
 

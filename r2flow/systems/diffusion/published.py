@@ -24,8 +24,8 @@ def _read_r2dm(content: Any, path: Path, averaged: bool = True) -> Published:
         if name.startswith(_NETWORK):
             weights[BACKBONE + name.removeprefix(_NETWORK)] = value
     step = int(content.get("global_step", 0))
-    sampler = {"name": "ddpm", "steps": 256}
-    return Published(config, weights, step, sampler, rings_of(config, weights))
+    rings = rings_of(config, weights)
+    return Published(config, weights, step, {"name": "ddpm", "steps": 256}, rings)
 
 
 def published_config(cfg: Options) -> Config:

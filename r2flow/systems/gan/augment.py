@@ -123,8 +123,7 @@ class AdaptiveAugment(nn.Module):
         magnitudes = {}
         for name, transformation in TRANSFORMATIONS.items():
             value = transformation.draw(source)
-            applies = source.uniform() < p
-            magnitudes[name] = torch.where(applies, value, transformation.identity)
+            magnitudes[name] = torch.where(source.uniform() < p, value, transformation.identity)
         return magnitudes
 
     def forward(self, x: Tensor, by: Magnitudes) -> Tensor:

@@ -135,8 +135,7 @@ class _Level(nn.Module):
         x = torch.cat([self.resample(x), rays.to(x.dtype)], dim=1)
         x = self.bias_act1(self.conv1(x, w))
         x = self.bias_act2(self.conv2(x, w))
-        heads = self.head(x, w)
-        return x, {name: o + self.resample(so_far[name]) for name, o in heads.items()}
+        return x, {name: o + self.resample(so_far[name]) for name, o in self.head(x, w).items()}
 
 
 class _Synthesis(nn.Module):
@@ -222,9 +221,8 @@ class DustyV2(Gan):
             )
         widths = [min(base_channels << i, max_channels) for i in reversed(range(doublings + 1))]
         synthesis = _Synthesis(shape, {IMAGE: channels, LOGIT: 1}, code, widths)
-        styles = 2 * len(widths)
         network = LatentGenerator(
-            latent, code, mapping, synthesis, RayDrop(temperature), tanh, styles
+            latent, code, mapping, synthesis, RayDrop(temperature), tanh, 2 * len(widths)
         )
         super().__init__(space, network)
         self.angle = space.rays[None].clone()

@@ -41,9 +41,12 @@ class _ResidualBlock(nn.Module):
             _norm(channels), nn.SiLU(), CircularConv2d(channels, out_channels)
         )
         self.emb_layers = nn.Sequential(nn.SiLU(), ExactLinear(condition_channels, out_channels))
-        last = zero_initialised(CircularConv2d(out_channels, out_channels))
-        # The identity is the dropout of the published network.
-        self.out_layers = nn.Sequential(_norm(out_channels), nn.SiLU(), nn.Identity(), last)
+        self.out_layers = nn.Sequential(
+            _norm(out_channels),
+            nn.SiLU(),
+            nn.Identity(),  # the dropout of the published network
+            zero_initialised(CircularConv2d(out_channels, out_channels)),
+        )
         self.skip_connection = projection(channels, out_channels)
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
@@ -106,8 +109,7 @@ class LatentUNet(nn.Module):
         channels, rows, columns = shape
         levels = len(multipliers)
         widths = [width * factor for factor in multipliers]
-        name = "the U-Net of the latents (generator.unet.multipliers)"
-        halved(name, (rows, columns), levels - 1)
+        halved("the U-Net of the latents (generator.unet.multipliers)", (rows, columns), levels - 1)
         condition = 4 * width
         self.width = width
         self.time_embed = nn.Sequential(
@@ -146,8 +148,8 @@ class LatentUNet(nn.Module):
                 current = widths[level]
             if level:
                 enlarge = nn.Upsample(scale_factor=2)
-                conv = CircularConv2d(current, current)
-                last.append(nn.Sequential(OrderedDict(enlarge=enlarge, conv=conv)))
+                layers = OrderedDict(enlarge=enlarge, conv=CircularConv2d(current, current))
+                last.append(nn.Sequential(layers))
         self.out = nn.Sequential(
             _norm(widths[0]), nn.SiLU(), zero_initialised(CircularConv2d(widths[0], channels))
         )

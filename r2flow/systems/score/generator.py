@@ -122,8 +122,9 @@ class ScoreModel(Generator):
         self.pull = pull
         channels, *shape = space.shape
         halved("RefineNet", shape, 1, least=4)
-        sigmas = _noise_levels(sigma_first, sigma_last, levels, spacing)
-        self.network = RefineNet(sigmas, channels, width)
+        self.network = RefineNet(
+            _noise_levels(sigma_first, sigma_last, levels, spacing), channels, width
+        )
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,8 @@ class Langevin(Sampler):
             return generator.pull * known * ((image + 1) / 2 - x)
 
         network = generator.network
-        rate = generator.rate
-        states = _annealed_langevin(network, x, network.sigmas, draws, rate, self.steps, pull)
+        states = _annealed_langevin(
+            network, x, network.sigmas, draws, generator.rate, self.steps, pull
+        )
         x = last_of(states, progress)
         return Generated.after(2 * x.clamp(0, 1) - 1, self.evaluations(generator), finite(x))

@@ -114,8 +114,9 @@ class _Fusion(nn.Module):
     def forward(self, maps: Sequence[Tensor]) -> Tensor:
         total = self.convs[0](maps[0])
         for conv, x in zip(self.convs[1:], maps[1:], strict=True):
-            size = total.shape[2:]
-            total = total + F.interpolate(conv(x), size, mode="bilinear", align_corners=True)
+            total = total + F.interpolate(
+                conv(x), total.shape[2:], mode="bilinear", align_corners=True
+            )
         return total
 
 
