@@ -258,27 +258,35 @@ class PartialOptions:
         bool, Option("--other-topics", help="Of a recording: keep its other topics, unchanged.")
     ] = False
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What answers depend on, of the scans."""
+        return {
+            "from": self.source,
+            "reflectance_scale": self.reflectance_scale,
+            "columns": self.columns,
+            "fill_gaps": self.fill_gaps,
+        }
+
     def model(self, name: str, device: str) -> "Checkpoint":
-        """The model, for another sensor if given."""
+        """The model, for another sensor if one is named."""
         from r2flow.lidar.sensors import named_sensor
         from r2flow.model.checkpoint import load_checkpoint
 
-        loaded = load_checkpoint(name, choose_device(device))
+        model = load_checkpoint(name, choose_device(device))
         if self.to or self.size:
-            loaded = loaded.through(named_sensor(self.to or loaded.sensor, self.size))
-        return loaded
+            model = model.through(named_sensor(self.to or model.sensor, self.size))
+        return model
 
     def open(
-        self, model: str, device: str, what: "Sequence[Described]"
+        self, name: str, device: str, what: "Sequence[Described]"
     ) -> "tuple[Checkpoint, list[PartialScan], list[str]]":
-        """The model, for another sensor if given, the scans as it takes them, and remarks on their
-        sensor.
-        """
-        loaded = self.model(model, device)
-        return loaded.open_partial(
+        """The model, the scans as it takes them, and remarks on their sensor."""
+        model = self.model(name, device)
+        return model.open_partial(
             what,
             self.source,
-            keep_beams=loaded.keeps_beams,
+            keep_beams=model.keeps_beams,
             scale=self.reflectance_scale,
             most=self.scans,
             columns=self.columns,
@@ -300,7 +308,7 @@ def complete(
         ),
     ],
     out: OutOption,
-    given: PartialOptions,
+    part: PartialOptions,
     how: SamplerOptions,
     checkpoint: Annotated[
         str | None,
@@ -349,88 +357,73 @@ def complete(
     from r2flow.reports.answers import write_completed
 
     if any(map(is_recording, what)):
-        only = len(what) == 1 and num == 1 and not (given.mask or given.hide or given.scans)
-        check(only, "a recording is completed alone, without --num, --mask, --hide and --scans.")
-        _complete_recording(
-            Path(what[0]), out, given, how, checkpoint or DENSIFY, precision, seed, device
-        )
+        alone = len(what) == 1 and num == 1 and not (part.mask or part.hide or part.scans)
+        check(alone, "a recording is completed alone, without --num, --mask, --hide and --scans.")
+        model = part.model(checkpoint or DENSIFY, device)
+        _print_model(checkpoint or DENSIFY)
+        _complete_recording(Path(what[0]), out, part, how, model, precision, seed)
         return
     check_folder(out)
-    mask = parse_mask(given.mask) if given.mask else None
-    hidden = frozenset(given.hide or ())
-    ids = label_list(given.label_ids or SEMANTIC_KITTI)
-    job = Job(num, seed, mask, given.fill_gaps, hidden, batch_size, pictures, label_ids=ids)
+    job = Job(
+        num,
+        seed,
+        parse_mask(part.mask) if part.mask else None,
+        part.fill_gaps,
+        frozenset(part.hide or ()),
+        batch_size,
+        pictures,
+        label_ids=label_list(part.label_ids or SEMANTIC_KITTI),
+        max_error=max_error,
+    )
     jumps = how.given.get("name", "jump") in ("jump", "transport")
     name = checkpoint or (DENSIFY if jumps else DEFAULT)
     described = [describe(one) for one in what]
-    loaded, scans, remarks = given.open(name, device, described)
+    model, scans, remarks = part.open(name, device, described)
     if checkpoint is None:
-        for_densify = given.to or given.size or how.sampler
+        for_densify = part.to or part.size or how.sampler
         if name == DENSIFY and not for_densify and lack_sectors(scans, job):
             name = DEFAULT
-            loaded, scans, remarks = given.open(name, device, described)
+            model, scans, remarks = part.open(name, device, described)
         _print_model(name)
-    for channel in given.hide or ():
+    channels = model.encoding.slices
+    for channel in job.hide:
         check(
-            channel in loaded.encoding.slices,
-            f"the model has the channels {', '.join(loaded.encoding.slices)}, not {channel}.",
+            channel in channels,
+            f"the model has the channels {', '.join(channels)}, not {channel}.",
         )
-    precision = precision or usual_precision(loaded.generator)
-    job = replace(job, precision=precision, max_error=max_error)
-    sampler = completing(loaded.generator, several=num > 1, **how.given)
-    for remark in remarks:
-        print(remark)
-    if not loaded.encoding.reflectance:
-        print("the model is of range alone: answers have no reflectance")
-    about = {
-        "mask": given.mask and mask_identity(given.mask),
-        "from": given.source,
-        "reflectance_scale": given.reflectance_scale,
-        "columns": given.columns,
-    }
-    write_completed(loaded, scans, out, job, sampler, about)
+    job = replace(job, precision=precision or usual_precision(model.generator))
+    sampler = completing(model.generator, several=num > 1, **how.given)
+    if not model.encoding.reflectance:
+        remarks.append("the model is of range alone: answers have no reflectance")
+    if remarks:
+        print(*remarks, sep="\n")
+    about = {"mask": part.mask and mask_identity(part.mask), **part.settings}
+    print(*write_completed(model, scans, out, job, sampler, about), sep="\n")
 
 
 def _complete_recording(
     path: Path,
     out: Path,
-    given: PartialOptions,
+    part: PartialOptions,
     how: SamplerOptions,
-    name: str,
+    model: "Checkpoint",
     precision: "Precision | None",
     seed: int,
-    device: str,
 ) -> None:
     from r2flow.model.completion import completing, usual_precision
     from r2flow.reports.outputs import recipe_of
     from r2flow.reports.recordings import complete_recording
 
     check_folder(out.parent)
-    model = given.model(name, device)
     sampler = completing(model.generator, **how.given)
-    precision = precision or usual_precision(model.generator)
-    completer = model.completer(
-        given.source,
-        reflectance_scale=given.reflectance_scale,
-        columns=given.columns,
-        fill_gaps=given.fill_gaps,
-        sampler=sampler,
-        precision=precision,
-    )
-    settings = {
-        "from": given.source,
-        "reflectance_scale": given.reflectance_scale,
-        "columns": given.columns,
-        "fill_gaps": given.fill_gaps,
-        "precision": precision,
-    }
-    recipe = recipe_of(model, seed, sampler, completion=settings)
-    _print_model(name)
+    settings = {**part.settings, "precision": precision or usual_precision(model.generator)}
+    recipe = recipe_of(model, seed, sampler, completion={**settings})
+    completer = model.completer(settings.pop("from"), sampler=sampler, **settings)
     complete_recording(
         path,
         out,
-        given.topic,
-        given.other_topics,
+        part.topic,
+        part.other_topics,
         lambda cloud, number: completer(cloud, number, seed),
         recipe,
     )

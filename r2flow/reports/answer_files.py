@@ -19,8 +19,7 @@ from r2flow.lidar.other_sensors import Partial
 from r2flow.lidar.projection import image_points
 from r2flow.lidar.scan_files import WRITTEN, scan_ending, write_cloud
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.model.completion import Completed
-from r2flow.reports.answer_rays import Job
+from r2flow.reports.answer_rays import Answered, Job
 from r2flow.reports.outputs import write_labelled
 from r2flow.store import Store, manifest_of
 
@@ -29,12 +28,10 @@ def answer_files(scan: PartialScan, out: Path, num: int) -> list[Path]:
     """Files of the answers to a scan: of its own format, if it can be written."""
     if scan.path and (out / scan.name).resolve().parent == scan.path.resolve().parent:
         raise InputError(f"{out} is the folder of the scans; give another --out.")
-    ending = scan.ending
-    ending = ending if ending in WRITTEN else ".ply"
-    if num == 1:
-        return [out / f"{scan.name}{ending}"]
+    ending = scan.ending if scan.ending in WRITTEN else ".ply"
     width = len(str(num - 1))
-    return [out / f"{scan.name}_{number:0{width}d}{ending}" for number in range(num)]
+    numbers = [f"_{number:0{width}d}" for number in range(num)] if num > 1 else [""]
+    return [out / f"{scan.name}{number}{ending}" for number in numbers]
 
 
 def check_inputs(
@@ -54,50 +51,45 @@ def check_inputs(
 
 
 def write_answers(
-    checkpoint: Checkpoint,
-    scan: PartialScan,
-    files: Sequence[Path],
-    given: Partial,
-    completed: Completed,
-    job: Job,
+    checkpoint: Checkpoint, answered: Answered, files: Sequence[Path], job: Job
 ) -> None:
     """Write the answers to a scan, and the spread of several."""
+    scan, known, completed = answered.scan, answered.known, answered.completed
     out = files[0].parent
     if len(files) > 1:
         deviation, returned = completed.spread.numpy()
-        spread = f"{Path(scan.name).name}.spread.npz"
-        with atomic_write(out / spread) as file:
+        with atomic_write(out / f"{Path(scan.name).name}.spread.npz") as file:
             np.savez_compressed(file, deviation=deviation, returned=returned)
     labelled = checkpoint.encoding.labels
     sensor = checkpoint.sensor
-    silent = given.points.reflectance is None if given.points else len(given.image) == 1
-    silent &= "reflectance" not in job.hide  # else that of the answer would be invented
+    rays = sensor.rays()
+    silent = known.points.reflectance is None if known.points else len(known.image) == 1
+    drawn = "reflectance" in job.hide
     for number, (path, image) in enumerate(zip(files, completed.images.numpy(), strict=True)):
         name = path.name.removesuffix(scan_ending(path.name) or path.suffix)
         if scan.image:
             if labelled:
-                write_labelled(image, sensor.rays(), path.parent, name, ["ply"], job.label_ids)
-            save_array(path, image[: 1 if silent else 2])
+                write_labelled(image, rays, out, name, ["ply"], job.label_ids)
+            save_array(path, image[: 1 if silent and not drawn else 2])  # none is invented
             continue
         with naming(scan.path or scan.name):
-            cloud = completed_cloud(given, image, sensor, completed.trust(number))
-        drawn = "reflectance" in job.hide and len(image) > 1
+            cloud = completed_cloud(known, image, sensor, completed.trust(number))
         if labelled or drawn:
-            values = _of_points(given, image, sensor.rays())
+            reflectance, *labels = _of_points(known, image, rays)
             if labelled:
-                write_labels(path.parent, name, *values[1:], ids=job.label_ids)
+                write_labels(out, name, *labels, ids=job.label_ids)
             if drawn:
-                cloud = cloud.with_reflectance(values[0] * given.scale)
+                cloud = cloud.with_reflectance(reflectance * known.scale)
         write_cloud(path, cloud)
 
 
-def _of_points(given: Partial, image: ndarray, rays: Tensor) -> ndarray:
+def _of_points(known: Partial, image: ndarray, rays: Tensor) -> ndarray:
     """The channels of an answer after its range at each point of a completed cloud, (C - 1, N):
     measured points have those of the nearest measured ray.
     """
-    assert given.points is not None
-    known = given.state == Ray.RETURN
-    xyz, values = image_points(image * known, rays, given.xyz)
-    _, estimated = image_points(image * ~known, rays)
-    nearest = cKDTree(xyz).query(given.points.xyz)[1]
+    assert known.points is not None
+    measured = known.state == Ray.RETURN
+    xyz, values = image_points(image * measured, rays, known.xyz)
+    _, estimated = image_points(image * ~measured, rays)
+    nearest = cKDTree(xyz).query(known.points.xyz)[1]
     return np.concatenate([values[:, nearest], estimated], axis=1)

@@ -5,12 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from r2flow.data.partial import PartialScan
 from r2flow.lidar.known import Ray
 from r2flow.lidar.labels import semantic_ids
-from r2flow.lidar.other_sensors import Partial
 from r2flow.lidar.sensors import Sensor
-from r2flow.model.completion import Completed
+from r2flow.reports.answer_rays import Answered
 from r2flow.reports.figures import save_figure
 from r2flow.reports.pictures import contact_sheet, trust_ids
 from r2flow.reports.view import Panel, write_viewer
@@ -22,12 +20,7 @@ _MOST = 4  # answers of a picture
 
 
 def draw_answers(
-    sensor: Sensor,
-    scan: PartialScan,
-    out: Path,
-    given: Partial,
-    completed: Completed,
-    compared: "Compared | None" = None,
+    sensor: Sensor, answered: Answered, out: Path, compared: "Compared | None" = None
 ) -> None:
     """Write `NAME.png` and `NAME.html` with your scan and up to four answers, and if a part was
     hidden the best interpolation, the truth, and both errors.
@@ -36,31 +29,32 @@ def draw_answers(
     reflectance in the scan, none is drawn.
     """
     rays = sensor.rays()
+    name, known, completed = answered.scan.name, answered.known, answered.completed
     answers = completed.images.numpy()[:_MOST]
     names = ["your scan", "completed"]
     if len(answers) > 1:
         names = ["your scan", *(f"completed, answer {i}" for i in range(len(answers)))]
-    images = [given.image, *answers]
-    title = scan.name
+    images = [known.image, *answers]
+    title = name
     if compared:
         from r2flow.reports.answer_errors import in_words  # slow
 
         images += [compared.interpolation, compared.truth]
-        names += [f"interpolation: {compared.errors.name}", "true"]
-        title += f", {in_words([compared.errors])}"
+        names += [f"interpolation: {compared.name}", "true"]
+        title += f", {in_words([compared])}"
     ids: list[np.ndarray | None] = [None] * len(images)
     if answers.shape[1] > 2:
         ids = [semantic_ids(image[2]) if len(image) > 2 else None for image in images]
     elif completed.densities:
         errors = completed.error(0.68)[0, : len(answers)].numpy()
         ids[: 1 + len(answers)] = map(trust_ids, images, [np.zeros_like(errors[0]), *errors])
-    images = [image[: min(len(given.image), 2)] for image in images]
+    images = [image[: min(len(known.image), 2)] for image in images]
     panels = [
-        Panel(name, image[None], rays, None if one is None else one[None])
-        for name, image, one in zip(names, images, ids, strict=True)
+        Panel(caption, image[None], rays, None if one is None else one[None])
+        for caption, image, one in zip(names, images, ids, strict=True)
     ]
-    write_viewer(out / f"{scan.name}.html", panels, title)
+    write_viewer(out / f"{name}.html", panels, title)
     if completed.densities:
         ids[0] = None  # all of it was measured
-    figure = contact_sheet(images, rays, names, given.state == Ray.UNKNOWN, ids)
-    save_figure(figure, out / f"{scan.name}.png")
+    figure = contact_sheet(images, rays, names, known.state == Ray.UNKNOWN, ids)
+    save_figure(figure, out / f"{name}.png")

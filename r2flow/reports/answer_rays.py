@@ -7,14 +7,14 @@ from functools import lru_cache
 import numpy as np
 
 from r2flow.base import noise
-from r2flow.base.errors import InputError
+from r2flow.base.errors import InputError, check
 from r2flow.base.progress import track
 from r2flow.data.partial import PartialScan
 from r2flow.generators.base import Precision
 from r2flow.lidar.known import Mask, Ray, share_in_sectors
 from r2flow.lidar.labels import SEMANTIC_KITTI, LabelList
 from r2flow.lidar.other_sensors import Partial, gaps_unknown
-from r2flow.lidar.scan_files import Points
+from r2flow.model.completion import Completed
 from r2flow.model.shipped import DEFAULT, DENSIFY
 
 
@@ -34,6 +34,16 @@ class Job:
     max_error: float | None = None  # metres that error_68 of an added point may have
 
 
+@dataclass(frozen=True)
+class Answered:
+    """A scan, what was known of it, and its answers."""
+
+    number: int
+    scan: PartialScan
+    known: Partial
+    completed: Completed
+
+
 def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
     """Whether most unknown rays of each scan lie in sectors without known rays; ignores scans
     without unknown rays.
@@ -48,66 +58,49 @@ def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
     if len(kinds) > 1:
         raise InputError(
             f"{kinds[True]} lacks whole sectors (--checkpoint {DEFAULT}) and {kinds[False]} does "
-            "not (--checkpoint "
-            f"{DENSIFY}): complete them apart, or give one --checkpoint for all."
+            f"not (--checkpoint {DENSIFY}): complete them apart, or give one --checkpoint for all."
         )
     return True in kinds
 
 
 @lru_cache(maxsize=16)  # read the scans of a small folder once
 def measured_rays(scan: PartialScan, job: Job) -> Partial:
-    """All that was measured of a scan."""
-    given = scan.read()
-    return _without(gaps_unknown(given) if job.fill_gaps else given, job.hide)
+    """All that was measured of a scan, without the hidden channels; without ranges, only its labels
+    are left.
+    """
+    measured = scan.read()
+    if job.fill_gaps:
+        measured = gaps_unknown(measured)
+    image = measured.image.copy()
+    if "label" in job.hide:
+        image = image[:2]
+    if "reflectance" in job.hide:
+        image[1:2] = 0
+    if "range" not in job.hide:
+        return replace(measured, image=image if image[1:].any() else image[:1])
+    image[:2] = 0
+    check(image.any(), "without ranges a scan has no known ray: give one with labels.")
+    return Partial(image, np.full_like(measured.state, Ray.UNKNOWN))
 
 
 def known_rays(scan: PartialScan, job: Job, number: int) -> Partial:
     """Known rays of scan `number` that the job's mask keeps, with their points; the mask depends
     only on (seed, number).
     """
-    given = measured_rays(scan, job)
+    partial = measured_rays(scan, job)
     if job.mask is None:
-        return given
-    measured = given.state != Ray.UNKNOWN
+        return partial
+    measured = partial.state != Ray.UNKNOWN
     kept = job.mask(measured, noise.generator(job.seed, "condition", number))
     for some, what in ((measured & kept, "nothing"), (measured & ~kept, "everything")):
-        if not some.any():
-            raise InputError(f"{scan.name}: the mask keeps {what} that was measured; give another.")
-    state = np.where(kept, given.state, np.uint8(Ray.UNKNOWN))
-    xyz = None if given.xyz is None else given.xyz * kept
-    masked = replace(given, image=given.image * kept, state=state, xyz=xyz)
-    return masked if given.points is None else _with_points_of(masked)
-
-
-def _with_points_of(given: Partial) -> Partial:
-    """A partial scan whose points are those of its known pixels alone."""
-    points = given.points
-    assert points is not None
-    assert points.kept is not None
-    assert given.place is not None
-    assert given.row is not None
-    chosen = np.unique(given.place[given.state == Ray.RETURN])
-    strength = points.reflectance
-    few = Points(
-        points.xyz[chosen],
-        None if strength is None else strength[chosen],
-        dropped=points.dropped,
-        kept=points.kept[chosen],
-        cloud=points.cloud,
-    )
-    return replace(given, points=few, row=given.row[chosen], place=None)
-
-
-def _without(given: Partial, hidden: frozenset[str]) -> Partial:
-    """A partial scan without some channels; without ranges, only its labels are left."""
-    image = given.image.copy()
-    if "label" in hidden:
-        image = image[:2]
-    if "reflectance" in hidden:
-        image[1:2] = 0
-    if "range" not in hidden:
-        return replace(given, image=image if image[1:].any() else image[:1])
-    image[:2] = 0
-    if not image.any():
-        raise InputError("without ranges a scan has no known ray: give one with labels.")
-    return Partial(image, np.full_like(given.state, Ray.UNKNOWN))
+        check(some.any(), f"{scan.name}: the mask keeps {what} that was measured; give another.")
+    state = np.where(kept, partial.state, np.uint8(Ray.UNKNOWN))
+    xyz = None if partial.xyz is None else partial.xyz * kept
+    masked = replace(partial, image=partial.image * kept, state=state, xyz=xyz)
+    points, place, row = partial.points, partial.place, partial.row
+    if points is None or points.kept is None or place is None or row is None:
+        return masked
+    few = np.unique(place[state == Ray.RETURN])  # the points in known pixels
+    reflectance = None if points.reflectance is None else points.reflectance[few]
+    left = replace(points, xyz=points.xyz[few], reflectance=reflectance, kept=points.kept[few])
+    return replace(masked, points=replace(left, ring=None), row=row[few], place=None)

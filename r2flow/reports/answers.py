@@ -1,10 +1,10 @@
 """Completion of scans to files: each is read, completed, written, drawn and counted."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from itertools import chain
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,18 +13,17 @@ import torch
 from r2flow.base.progress import Bar
 from r2flow.data.partial import PartialScan
 from r2flow.generators import Sampler
-from r2flow.lidar.other_sensors import Partial
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.model.completion import Completed, complete
-from r2flow.reports.answer_counts import Counts, print_counts
+from r2flow.model.completion import complete
+from r2flow.reports.answer_counts import Counts
 from r2flow.reports.answer_files import answer_files, check_inputs, write_answers
 from r2flow.reports.answer_pictures import draw_answers
-from r2flow.reports.answer_rays import Job, known_rays, measured_rays
+from r2flow.reports.answer_rays import Answered, Job, known_rays, measured_rays
 from r2flow.reports.outputs import recipe_of
 from r2flow.store import Store, manifest_of
 
 if TYPE_CHECKING:
-    from r2flow.reports.answer_errors import Compared, Errors
+    from r2flow.reports.answer_errors import Compared
 
 _THREADS = 4  # at most: Python's own work is done by one thread at a time
 
@@ -36,15 +35,14 @@ def write_completed(
     job: Job,
     sampler: Sampler,
     about: Mapping[str, Any],
-) -> None:
-    """Complete scans; write answers, their spread, pictures and 3-D pages; print counts.
+) -> list[str]:
+    """Complete scans; write answers, their spread, pictures and 3-D pages; returns lines on them.
 
     Scans whose answers are all in the folder are skipped. `about` has the other settings that
     affect the answers, as plain values.
     """
     settings = {
         "num": job.num,
-        "fill_gaps": job.fill_gaps,
         **about,
         "precision": job.precision,
         "max_error": job.max_error,
@@ -59,71 +57,92 @@ def write_completed(
         for number, scan in enumerate(scans)
         if not all(path.is_file() for path in files[scan.name])
     ]
+    evaluations = math.ceil(job.num / job.batch_size) * (
+        sampler.evaluations(checkpoint.generator) or 0
+    )
+    bar = Bar("completing", len(left) * job.num, "answers", evaluations=len(left) * evaluations)
+    completer = _Completer(checkpoint, scans, files, job, sampler, bar)
     counts = Counts()
-    errors: dict[str, Errors] = {}
-    batches = math.ceil(job.num / job.batch_size) * (sampler.evaluations(checkpoint.generator) or 0)
-    bar = Bar("completing", len(left) * job.num, "answers", evaluations=len(left) * batches)
+    beside: dict[str, Compared] = {}
+    with bar:
+        for answered in completer.completed(left, store, inputs):
+            name = answered.scan.name
+            if job.mask is not None and "range" not in job.hide:
+                from r2flow.reports.answer_errors import compared, write_errors  # slow
 
-    def answer(number: int) -> tuple[Partial, Completed]:
-        given = known_rays(scans[number], job, number)
+                measured = measured_rays(answered.scan, job)
+                beside[name] = compared(measured, answered, checkpoint.sensor)
+                write_errors(out, {name: beside[name]})
+            if answered.number < job.pictures:
+                draw_answers(checkpoint.sensor, answered, out, beside.get(name))
+            counts.add(answered)
+        bar.set(len(left) * job.num)
+    lines = counts.lines(checkpoint.sensor)
+    if beside:
+        from r2flow.reports.answer_errors import COMPARE, in_words
+
+        lines.append(f"{in_words([*beside.values()])}; see {out / COMPARE}")
+    written = [f"{len(left)} scan{'' if len(left) == 1 else 's'} written to {out}"]
+    if len(left) < len(scans):
+        written.append(f"{len(scans) - len(left)} there already")
+    if left:
+        written.append(f"{counts.added / len(left) / job.num:,.0f} new points a scan")
+    endings = {scan.ending: files[scan.name][0].suffix for scan in scans}
+    written += [f"{one} as {other}" for one, other in endings.items() if one != other]
+    return [*lines, ", ".join(written)]
+
+
+@dataclass(frozen=True)
+class _Completer:
+    """Completes scans and writes their answers, several at once."""
+
+    checkpoint: Checkpoint
+    scans: Sequence[PartialScan]
+    files: Mapping[str, Sequence[Path]]  # by name
+    job: Job
+    sampler: Sampler
+    bar: Bar
+
+    def completed(
+        self, numbers: Sequence[int], store: Store, inputs: Mapping[str, str]
+    ) -> Iterator[Answered]:
+        """Complete some scans in order; the first shows that the settings are valid."""
+        if not numbers:
+            return
+        first = self.answer(numbers[0])
+        store.begin()  # commands for other scans add theirs at the same time
+        before = manifest_of(store.folder)
+        scales = {scan.name: scan.scale for scan in self.scans}
+        store.write_manifest(
+            inputs={**before.get("inputs", {}), **inputs},
+            reflectance_scales={**before.get("reflectance_scales", {}), **scales},
+        )
+        with _threads(self.checkpoint) as pool:
+            others = pool.map(lambda number: self.write(self.answer(number)), numbers[1:])
+            yield self.write(first)
+            yield from others
+
+    def answer(self, number: int) -> Answered:
+        scan, job = self.scans[number], self.job
+        known = known_rays(scan, job, number)
         (completed,) = complete(
-            checkpoint,
-            torch.from_numpy(given.image)[None],
-            torch.from_numpy(given.state)[None],
+            self.checkpoint,
+            torch.from_numpy(known.image)[None],
+            torch.from_numpy(known.state)[None],
             job.num,
             job.seed,
-            sampler=sampler,
+            sampler=self.sampler,
             batch_size=job.batch_size,
             first=number,
             precision=job.precision,
             max_error=job.max_error,
-            progress=bar.evaluated,
+            progress=self.bar.evaluated,
         )
-        return given, completed
+        return Answered(number, scan, known, completed)
 
-    def write(number: int, given: Partial, completed: Completed) -> tuple[Partial, Completed]:
-        scan = scans[number]
-        write_answers(checkpoint, scan, files[scan.name], given, completed, job)
-        return given, completed
-
-    with bar, _threads(checkpoint) as pool:
-        done: Iterable[tuple[Partial, Completed]] = ()
-        if left:
-            first = answer(left[0])  # it shows that the settings are valid
-            store.begin()  # commands for other scans add theirs at the same time
-            before = manifest_of(out)
-            scales = {scan.name: scan.scale for scan in scans}
-            store.write_manifest(
-                inputs={**before.get("inputs", {}), **inputs},
-                reflectance_scales={**before.get("reflectance_scales", {}), **scales},
-            )
-            others = pool.map(lambda number: write(number, *answer(number)), left[1:])
-            done = chain([write(left[0], *first)], others)
-        for number, (given, completed) in zip(left, done, strict=True):
-            scan = scans[number]
-            beside: Compared | None = None
-            if job.mask is not None and "range" not in job.hide:
-                from r2flow.reports.answer_errors import compared, write_errors  # slow
-
-                measured = measured_rays(scan, job)
-                beside = compared(measured, given, completed, checkpoint.sensor)
-                errors[scan.name] = beside.errors
-                write_errors(out, {scan.name: beside.errors})
-            if number < job.pictures:
-                draw_answers(checkpoint.sensor, scan, out, given, completed, beside)
-            counts.add(scan, given, completed)
-        bar.set(len(left) * job.num)
-    print_counts(checkpoint.sensor, counts)
-    if errors:
-        from r2flow.reports.answer_errors import COMPARE, in_words
-
-        print(f"{in_words([*errors.values()])}; see {out / COMPARE}")
-    written = f"{len(left)} scan{'' if len(left) == 1 else 's'} written to {out}"
-    skipped = [f"{len(scans) - len(left)} there already"] if len(left) < len(scans) else []
-    new = [f"{counts.added / len(left) / job.num:,.0f} new points a scan"] if left else []
-    endings = {scan.ending: files[scan.name][0].suffix for scan in scans}
-    other = [f"{own} as {given}" for own, given in endings.items() if own != given]
-    print(", ".join([written, *skipped, *new, *other]))
+    def write(self, answered: Answered) -> Answered:
+        write_answers(self.checkpoint, answered, self.files[answered.scan.name], self.job)
+        return answered
 
 
 @contextmanager
