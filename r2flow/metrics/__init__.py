@@ -34,8 +34,6 @@ METRICS: Registry[Callable[..., ScanMetric]] = Registry(
     mmd_lidm=lazy("r2flow.metrics.lidm:MMDLiDM"),
     panel=lazy("r2flow.metrics.panel:Panel"),
     things=lazy("r2flow.metrics.things:Things"),
-    auc=lazy("r2flow.metrics.features:TwoSample", "handcrafted"),
-    auc_range=lazy("r2flow.metrics.features:TwoSample", "handcrafted_range"),
 )
 
 

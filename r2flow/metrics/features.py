@@ -1,11 +1,10 @@
-"""Metrics on a network's features of scans: distances, precision and recall, two-sample test."""
+"""Metrics on a network's features of scans: distances, precision and recall."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from r2flow.metrics import FIELD_NAMES
@@ -17,7 +16,6 @@ from r2flow.metrics.scans import Scans
 
 NEIGHBOURS = 5  # k of `Manifold`
 _TIE = 1e-9  # relative tolerance: neighbours at exactly the radius count as inside
-_SAME = 1e-5  # relative tolerance of equal scores
 _FEW = (
     "fewer scans than features on a side: its covariance has no full rank, and the distance is too "
     "large; compare it only with distances of as many scans."
@@ -197,80 +195,3 @@ def _squared_radii(rows: Tensor) -> Tensor:
     """Squared distance of each row to its k-th nearest neighbour, (N,); it is its own first."""
     nearest = [squared_distances(x, rows).kthvalue(NEIGHBOURS + 1).values for _, x in blocks(rows)]
     return torch.cat(nearest)
-
-
-class TwoSample(_FeatureMetric):
-    """Area under the ROC curve of a logistic regression between two sets (Lopez-Paz, Oquab 2017).
-
-    Each contiguous half of both sets is scored by the classifier trained on the other half, so that
-    neighbouring scans of a drive do not leak. 0.5: the sets cannot be distinguished; 1: always
-    distinguished. `_low` and `_high` are a 95 % interval for other, independent scans judged by
-    these two classifiers, of as many as half: both err alike.
-    """
-
-    kind = "auc"
-    names: ClassVar = {"handcrafted": "auc", "handcrafted_range": "auc_range"}
-    settings: ClassVar = {"classifier": "logistic, ridge 1", "folds": "two halves, score interval"}
-    fewest = 4  # two to train on, two to test
-
-    @property
-    def labels(self) -> list[str]:
-        return [self.name, f"{self.name}_low", f"{self.name}_high"]
-
-    def values(self, real: Tensor, generated: Tensor) -> list[float]:
-        n = len(real) // 2
-        m = len(generated) // 2
-        real_halves = real.double().tensor_split([n])
-        generated_halves = generated.double().tensor_split([m])
-        value = 0.0
-        for trained, judged in ((0, 1), (1, 0)):
-            score = _classifier(real_halves[trained], generated_halves[trained])
-            value += area(score(real_halves[judged]), score(generated_halves[judged])) / 2
-        return [value, *interval(value, n, m)]
-
-
-def area(negative: Tensor, positive: Tensor) -> float:
-    """P(positive > negative) + P(equal) / 2 for scores (N,) and (M,)."""
-    difference = positive[None] - negative[:, None]
-    # Features of a scan differ by rounding between batches.
-    equal = difference.abs() < _SAME * (1 + positive.abs())
-    return float(torch.where(equal, 0.5, (difference > 0).double()).mean())
-
-
-def interval(value: float, n: int, m: int) -> tuple[float, float]:
-    """Ends of all a with |a - value| <= 1.96 se(a) (Newcombe 2006), of n by m scores.
-
-    se is that of Hanley and McNeil (1982). It is a's error: the value's is 0 if all pairs agree.
-    """
-    grid = torch.linspace(-20, 20, 100_001).double().sigmoid()
-    a = torch.cat([grid, torch.tensor([value], dtype=torch.float64)])
-    both = ((n + m) / 2 - 1) * ((1 - a) / (2 - a) + a / (1 + a))
-    variance = a * (1 - a) * (1 + both) / (n * m)
-    inside = a[(a - value).square() <= 1.96**2 * variance]
-    return float(inside.amin()), float(inside.amax())
-
-
-def _classifier(real: Tensor, generated: Tensor) -> Callable[[Tensor], Tensor]:
-    """Fit a logistic regression to two sets of equal total weight.
-
-    Returns its score function, (N, D) to (N,).
-    """
-    rows = torch.cat([real, generated])
-    centre = rows.mean(0)
-    spread = rows.std(0).clamp(min=1e-9)
-
-    def with_bias(rows):
-        return F.pad((rows - centre) / spread, (0, 1), value=1.0)
-
-    x = with_bias(rows)
-    y = (torch.arange(len(rows)) >= len(real)).double()
-    weight = len(y) / 2 / torch.where(y > 0, len(generated), len(real)).double()
-    # An L2 penalty of 1 on the weights of standardised features.
-    penalty = torch.ones_like(x[0])
-    penalty[-1] = 1e-9
-    w = torch.zeros_like(penalty)
-    for _ in range(25):  # Newton's method
-        p = (x @ w).sigmoid()
-        curvature = (x * (weight * p * (1 - p))[:, None]).mT @ x + penalty.diag()
-        w = w - torch.linalg.solve(curvature, x.mT @ (weight * (p - y)) + penalty * w)
-    return lambda rows: with_bias(rows) @ w

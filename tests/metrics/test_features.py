@@ -1,14 +1,13 @@
 """Precision, recall, density, coverage and the kernel distance of features."""
 
-import math
 from itertools import combinations, product
 
 import numpy as np
 import pytest
 import torch
 
-from r2flow.metrics import METRICS, features
-from r2flow.metrics.features import KernelDistance, Manifold, area, interval
+from r2flow.metrics import features
+from r2flow.metrics.features import KernelDistance, Manifold
 from r2flow.metrics.jsd_mmd import squared_distances
 from tests.metrics.conftest import Summary, given
 
@@ -113,46 +112,3 @@ def test_the_kernel_distance_is_the_reference_on_its_own_subsets(shared):
                 )
                 values.append(kernel_distance(x, y))
             assert np.mean(values) == pytest.approx(expected, rel=1e-6)  # theirs is float32
-
-
-def auc(real, generated):
-    return given(METRICS["auc"](), real, generated)["auc"]
-
-
-@pytest.mark.parametrize("apart", [0.0, 1.0, 3.0])
-def test_gaussians_have_the_area_of_their_distance(apart):
-    draw = torch.Generator().manual_seed(4)
-    x, y = torch.randn(4000, 3, generator=draw), torch.randn(4000, 3, generator=draw)
-    y[:, 1] += apart
-    # P(N(apart, 1) > N(0, 1)) = Phi(apart / sqrt 2); the error of an area of 2 x 4,000 scores is
-    # below 0.007
-    assert auc(x, y) == pytest.approx((1 + math.erf(apart / 2)) / 2, abs=0.02)
-
-
-def test_halves_are_blocks_so_that_neighbours_do_not_help():
-    """Each half of the generated set differs from the real one in the other direction: nothing that
-    generalises.
-    """
-    draw = torch.Generator().manual_seed(6)
-    x, y = torch.randn(400, 2, generator=draw), torch.randn(400, 2, generator=draw)
-    y[:200, 0] += 3
-    y[200:, 0] -= 3
-    assert auc(x, y) < 0.2
-
-
-def test_the_area_is_a_count_of_pairs_and_its_interval_covers_it_near_1():
-    value = area(torch.tensor([0.1, 0.4, 0.4]).double(), torch.tensor([0.4, 0.9]).double())
-    assert value == pytest.approx((1 + 0.5 + 0.5 + 3) / 6)
-    scores = torch.randn(500, 70, generator=torch.Generator().manual_seed(7)).double()
-    for apart in (0, 1, 3):
-        ends = [interval(area(x[:40], x[40:] + apart), 40, 30) for x in scores]
-        covered = np.mean([low <= (1 + math.erf(apart / 2)) / 2 <= high for low, high in ends])
-        assert 0.93 < covered < 0.995  # 0.80 at 3 by the value's variance, 0 if all pairs agree
-
-
-def test_the_interval_of_equal_sets_covers_one_half():
-    sets = torch.randn(150, 2, 40, 60, generator=torch.Generator().manual_seed(8))
-    found = [given(METRICS["auc"](), *pair) for pair in sets]
-    covered = np.mean([one["auc_low"] <= 0.5 <= one["auc_high"] for one in found])
-    # of 150 intervals, 1.8 % of error; 0.86 if the halves' errors were independent
-    assert 0.92 < covered < 0.99
