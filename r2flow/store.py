@@ -30,7 +30,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from r2flow.base.config import at_most_three, differences
-from r2flow.base.errors import InputError
+from r2flow.base.errors import InputError, check
 from r2flow.base.files import clear_leftovers, locked, read_json, write_file
 from r2flow.base.hashing import state_hash
 from r2flow.base.pool import attempts_of
@@ -46,10 +46,6 @@ QUIET = 20.0  # seconds of waiting before a log message
 
 class Damaged(Exception):
     """A file does not have the content that was written."""
-
-
-class _Foreign(InputError):
-    """A manifest.json that r2flow did not write."""
 
 
 class Store:
@@ -74,8 +70,7 @@ class Store:
         another recipe, if `claimed` also its manifest alone.
         """
         if (self.folder / MANIFEST).is_file():
-            recipe = read_manifest(self.folder, self.kind)["recipe"]
-            other = [*differences(recipe, self.described).values()]
+            other = [*differences(self.recipe_there(), self.described).values()]
             if other:
                 if not claimed and len(os.listdir(self.folder)) == 1:
                     return False  # its command was refused before it made anything
@@ -92,6 +87,17 @@ class Store:
                     f"give another folder by {self.option}."
                 )
         return False
+
+    def recipe_there(self) -> Config:
+        """The recipe in the folder's manifest; refuses a manifest of another kind."""
+        content = manifest_of(self.folder)
+        where = f"{self.folder / MANIFEST} is damaged, or not of r2flow: give another folder."
+        check(content, where)
+        kind = content["format"].removeprefix("r2flow ")
+        same = kind == self.kind
+        check(same, f"{self.folder} holds {kind}, not {self.kind}; give another folder.")
+        recipe: Config = content["recipe"]
+        return recipe
 
     def begin(self, **notes: Any) -> None:
         """Claim the folder for the recipe: write the manifest, with `notes`, if it is missing.
@@ -271,38 +277,20 @@ class FileStore(Store):
         return all(file.is_file() for file in self.files(item))
 
 
-def read_manifest(folder: Path, kind: str | None = None) -> Config:
-    """Read and verify the manifest of a folder."""
-    path = folder / MANIFEST
+def manifest_of(folder: str | Path) -> Config:
+    """The verified manifest that r2flow wrote in a folder; empty if there is none."""
+    path = Path(folder).expanduser() / MANIFEST
     try:
         content: Config = read_json(path)
         if "checksum" not in content:  # a common name: of a data set, say
-            raise _Foreign(f"{path} is damaged, or not of r2flow: give another folder.")
-        format_name = content["format"]
-        _ = content["recipe"]
-        damaged = content.pop("checksum") != checksum(content)
-    except (OSError, _Foreign):
-        raise
-    except (ValueError, LookupError, TypeError, AttributeError):
-        damaged = True
-    if damaged:
-        raise InputError(
-            f"{path} is damaged. If r2flow wrote {folder}, remove it and make it again."
-        )
-    if kind is not None and format_name != f"r2flow {kind}":
-        raise InputError(
-            f"{folder} holds {format_name.removeprefix('r2flow ')}, not {kind}; "
-            "give another folder."
-        )
-    return content
-
-
-def manifest_of(folder: str | Path) -> Config:
-    """The manifest that r2flow wrote in a folder; empty if there is none."""
-    try:
-        return read_manifest(Path(folder).expanduser())
-    except (FileNotFoundError, NotADirectoryError, _Foreign):
+            return {}
+        whole = content.pop("checksum") == checksum(content) and "recipe" in content
+    except (FileNotFoundError, NotADirectoryError):
         return {}
+    except (ValueError, TypeError, AttributeError):
+        whole = False
+    check(whole, f"{path} is damaged. If r2flow wrote {folder}, remove it and make it again.")
+    return content
 
 
 def checksum(content: Any) -> str:

@@ -15,7 +15,7 @@ from r2flow.data.opening import open_scans
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor, read_sensor
-from r2flow.store import read_manifest
+from r2flow.store import manifest_of
 from tests.training.conftest import TINY, in_process
 
 MINE = Sensor("mine", (12.0, 5.0, 1.0, 0.0, -1.5, -4.0, -9.0, -20.0), columns=128)
@@ -101,7 +101,7 @@ def test_the_sensor_of_scan_files_is_detected_and_another_is_warned_of(r2flow, t
                 else ("scans of pandar64",)
             )
             assert all(word in warnings[0] for word in words)
-    assert read_manifest(out / "prepare")["recipe"]["reading"]["sensor"]["name"] == "pandar64"
+    assert manifest_of(out / "prepare")["recipe"]["reading"]["sensor"]["name"] == "pandar64"
     images = [np.load(out / f"show{forced}" / "000000.npy") for forced in ("", "--sensorhdl64e")]
     # hdl64e sees 92 % of the returns
     assert (images[0][0] > 0).sum() > 1.1 * (images[1][0] > 0).sum()
@@ -168,7 +168,7 @@ def test_the_scale_of_reflectance_is_taken_from_the_sensor(r2flow, scans: Path, 
     assert r2flow(
         "prepare", scans, "--sensor", out, "--out", tmp_path / "prepared", "--workers", 1
     ).quiet
-    assert read_manifest(tmp_path / "prepared")["recipe"]["reading"]["reflectance_scale"] == 255
+    assert manifest_of(tmp_path / "prepared")["recipe"]["reading"]["reflectance_scale"] == 255
     given = (
         scans,
         scans / "000000.bin",

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
-import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
@@ -26,7 +25,6 @@ from r2flow.data.loader import (
     ItemFormat,
     Mixture,
     Order,
-    Permutations,
     RunSampler,
 )
 from r2flow.data.options import (
@@ -42,14 +40,13 @@ from r2flow.data.own import DATASET
 from r2flow.data.pairs import PairDataset, PairStore
 from r2flow.data.reading import AUTO
 from r2flow.data.resolving import lacking_reflectance, plan_data, reflectance_levels
-from r2flow.data.run_scans import in_memory, open_for_training, open_plan, order_of
+from r2flow.data.run_scans import Scans, in_memory, open_for_training, open_plan, order_of
 from r2flow.data.sources import holdout_block, spread
 from r2flow.lidar.encoding import Encoding, encoding_options
 from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
 
 log = logging.getLogger(__name__)
 
-Scans = Mixture | np.ndarray  # scans, or the numbers of pairs
 HeldOut = DataLoader[Item] | list[Any]  # an empty list: there are none
 
 
@@ -260,9 +257,7 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
             self.validation_source = in_memory(self.validation_source, "validation scans", most)
 
     def _order(self, source: Scans) -> Order:
-        if isinstance(source, Mixture):
-            return order_of(source, self.plan.weights, self.seed)
-        return Permutations(len(source), self.seed)
+        return order_of(source, self.plan.weights, self.seed)
 
     def fingerprint(self) -> str:
         """Identity of the data, independent of its path: a run resumes only with the same scans and

@@ -16,6 +16,8 @@ from r2flow.lidar.scan_files import (
 )
 from r2flow.store import MANIFEST, manifest_of
 
+Names = tuple[str, ...]  # paths of files, or endings of their names
+
 KITTI_360_SPLIT = {"train": (3, 4, 5, 6, 7, 9, 10), "test": (0, 2)}
 ODOMETRY_SPLIT = {
     "train": (0, 1, 2, 3, 4, 5, 6, 7, 9, 10),
@@ -45,7 +47,7 @@ class Drive:
 
     name: str  # its name in `data.drives`
     # paths as strings: 100,000 Path objects take seconds and ten times the memory
-    scans: tuple[str, ...]
+    scans: Names
 
 
 def kitti_360(root: Path) -> list[Drive]:
@@ -86,23 +88,21 @@ def nuscenes(root: Path) -> list[Drive]:
     A drive is a log, named at the start of each file name: n015-2018-07-24-11-22-45+0800. Samples,
     the annotated scans, and sweeps are merged in the order of recording.
     """
-    logs: dict[str, list[tuple[str, str]]] = {}
-    for folder in (root / "samples" / "LIDAR_TOP", root / "sweeps" / "LIDAR_TOP", root):
-        for path in _files(folder, (".pcd.bin",)):
-            file = os.path.basename(path)
-            logs.setdefault(file.partition("__")[0], []).append((file, path))
-    return [
-        Drive(log, tuple(path for _, path in sorted(scans))) for log, scans in sorted(logs.items())
-    ]
+    logs: dict[str, list[str]] = {}
+    folders = (root / "samples" / "LIDAR_TOP", root / "sweeps" / "LIDAR_TOP", root)
+    paths = [path for folder in folders for path in _files(folder, (".pcd.bin",))]
+    for path in sorted(paths, key=os.path.basename):
+        logs.setdefault(os.path.basename(path).partition("__")[0], []).append(path)
+    return [Drive(log, tuple(scans)) for log, scans in sorted(logs.items())]
 
 
 def pandaset(root: Path) -> list[Drive]:
     """`NNN/lidar/FF.pkl.gz` with poses.json and timestamps.json beside them, or one drive."""
-    folders = [f for f in (root, root / "lidar", *sorted(root.glob("*/lidar"))) if f.is_dir()]
+    folders = [root, root / "lidar", *sorted(root.glob("*/lidar"))]
     return [
-        Drive(folder.resolve().parent.name, _files(folder, TABLE_ENDINGS))
+        Drive(place.parent.name, _files(folder, TABLE_ENDINGS))
         for folder in folders
-        if folder.resolve().name == "lidar"
+        if (place := folder.resolve()).name == "lidar"
     ]
 
 
@@ -165,7 +165,7 @@ def elsewhere(root: Path) -> str:
     return next((f" {path} {advice}." for path in paths if (advice := conversion_of(path))), "")
 
 
-def _one_of_each(paths: tuple[str, ...]) -> tuple[str, ...]:
+def _one_of_each(paths: Names) -> Names:
     images_last = sorted(paths, key=lambda path: path.lower().endswith(".npy"))
     kept = set({path[: len(path) - len(scan_ending(path))]: path for path in images_last}.values())
     return tuple(path for path in paths if path in kept)
@@ -199,12 +199,12 @@ def numbers(name: str) -> set[int]:
     return {int(digits)} if digits.isdecimal() else set()
 
 
-def _files(folder: Path, endings: tuple[str, ...]) -> tuple[str, ...]:
+def _files(folder: Path, endings: Names) -> Names:
     """The files of a folder with some endings, in order; none without such a folder."""
     return _scans(folder, os.listdir(folder), endings) if folder.is_dir() else ()
 
 
-def _scans(folder: Path, names: Iterable[str], endings: tuple[str, ...]) -> tuple[str, ...]:
+def _scans(folder: Path, names: Iterable[str], endings: Names) -> Names:
     """The files with some endings, in the order of the numbers in their names (2.bin before
     10.bin), without hidden files (macOS writes ._NAME next to NAME).
     """

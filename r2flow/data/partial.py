@@ -13,7 +13,7 @@ from r2flow.data.opening import open_scans
 from r2flow.data.options import PREPARED, SIMULATED
 from r2flow.data.partial_images import is_image, read_partial
 from r2flow.data.reading import Reading
-from r2flow.data.seeing import lines_about, seeing_all, sight
+from r2flow.data.seeing import Sight, lines_about, seeing_all, sight
 from r2flow.data.sensor_checks import a_few
 from r2flow.data.sources import spread
 from r2flow.lidar.other_sensors import Partial, image_through
@@ -91,33 +91,31 @@ def _files(
     scale: float | None,
 ) -> Opened:
     target = reading.sensor
-    lines: list[str] = []
     stored = described.stored
     folder = described.options.folder
-    named = source
-    source = source or (stored.sensor if stored else None)
+    sensor = source or (stored.sensor if stored else None)
+    ids = reading.label_ids if reading.labels else None
+    lines: list[str] = []
     whole = None
     full = 1.0
-    ids = reading.label_ids if reading.labels else None
+    see: Sight | None = None
     images = {path for path in paths if path.suffix.lower() == ".npy" and is_image(path)}
-    read: Callable[[Path], Partial] = partial(read_partial, source=source, target=target, ids=ids)
-    read_image = read
     if points := [path for path in paths if path not in images]:
         scans = {path: measured_points(path, reading.columns) for path in a_few(points)}
         again = any(scan.cloud and scan.cloud.place("measured") for scan in scans.values())
-        seen = sight(described, scans, reading, named if again else source, scale)
+        seen = sight(described, scans, reading, source if again else sensor, scale)
+        see = seen.see
         lines = seen.lines
         whole = seen.whole
         full = seen.scale or 1.0
+    elif sensor and not sensor.same_image(target):
+        lines = lines_about(described.label, sensor, target)
+        whole = seeing_all(sensor, target)
 
-        def read(path: Path) -> Partial:
-            if path in images:
-                return read_image(path)
-            return seen.see(path, measured_points(path, reading.columns))
-
-    elif source and not source.same_image(target):
-        lines = lines_about(described.label, source, target)
-        whole = seeing_all(source, target)
+    def read(path: Path) -> Partial:
+        if see is None or path in images:
+            return read_partial(path, sensor, target, ids)
+        return see(path, measured_points(path, reading.columns))
 
     def opened(path: Path) -> PartialScan:
         ending = scan_ending(path.name) or path.suffix

@@ -3,6 +3,8 @@
 import logging
 from collections.abc import Sequence
 
+import numpy as np
+
 from r2flow.data.described import Described
 from r2flow.data.loader import MixedOrder, Mixture, Order, Permutations
 from r2flow.data.options import ValidationOptions
@@ -15,6 +17,7 @@ from r2flow.lidar.sensors import Sensor
 log = logging.getLogger(__name__)
 
 Opened = tuple[Mixture, Mixture, list[str]]
+Scans = Mixture | np.ndarray  # scans, or the numbers of pairs
 
 
 def open_for_training(
@@ -88,8 +91,8 @@ def in_memory(source: Mixture, what: str, most_gib: float) -> Mixture:
     return Mixture(parts)
 
 
-def order_of(source: Mixture, weights: Sequence[float], seed: int) -> Order:
-    """The order of a mixture's images: by the weights of several parts, else by permutations."""
-    if len(weights) > 1:
+def order_of(source: Scans, weights: Sequence[float], seed: int) -> Order:
+    """The order of images: by the weights of several parts of a mixture, else by permutations."""
+    if isinstance(source, Mixture) and len(weights) > 1:
         return MixedOrder([len(part) for part in source.parts], weights, seed)
     return Permutations(len(source), seed)

@@ -28,6 +28,7 @@ class ScanSource(ABC):
     #: whether a network draws the images on access: only in this process, each image once if
     #: possible
     drawn = False
+    unsolved = 0  #: scans so far that a network's solver has not solved to the tolerance
     #: numbers of the scans of each recording, by its name, if known
     drives: Mapping[str, Sequence[int]] = {}
     contents = ""  #: digest of what is cheaply known of the scans, equal for a copy of the data set

@@ -113,6 +113,10 @@ def bar(doing: str, total: int) -> Bar:
     return Bar(doing, total, shown=None if rank_and_world_size()[0] == 0 else False)
 
 
+def _of_all_processes(count: int) -> int:
+    return int(sum_over_processes(torch.tensor(count)))
+
+
 @dataclass
 class Measurer:
     """Compares sets of scans by some metrics, under the rules of a protocol."""
@@ -145,8 +149,8 @@ class Measurer:
             if self.cache is not None and real.identity is not None:
                 keys[name] = key_of(metric, real, choice + points)
                 cached = self.cache.read(keys[name])
-                readers = sum_over_processes(torch.tensor(int(cached is not None)))
-                if cached is not None and readers == rank_and_world_size()[1]:  # of all processes
+                readers = _of_all_processes(int(cached is not None))
+                if cached is not None and readers == rank_and_world_size()[1]:
                     gathered[name] = cached
                     continue
             metric.reset()
@@ -175,10 +179,9 @@ class Measurer:
         for name, metric in self.metrics.items():
             metric.reset()
             metric.load_real_state(real[name].states)
-        before = getattr(generated.source, "unsolved", 0)
+        before = generated.source.unsolved
         empty = self._update([*self.metrics], generated, range(len(generated)), False)
-        new = getattr(generated.source, "unsolved", 0) - before
-        unsolved = int(sum_over_processes(torch.tensor(new)))
+        unsolved = _of_all_processes(generated.source.unsolved - before)
         sensor = generated.sensor
         rules = self.rules
         described = {
@@ -240,7 +243,7 @@ class Measurer:
                 for metric in metrics:
                     metric.update(batch, real, share)
                 advance(len(images))
-        return int(sum_over_processes(torch.tensor(empty)))
+        return _of_all_processes(empty)
 
 
 def speed_result(real: ScanSet, generated: ScanSet) -> MetricResult:

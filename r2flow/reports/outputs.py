@@ -28,7 +28,7 @@ from r2flow.model.saving import weights_hash
 from r2flow.reports.figures import save_figure
 from r2flow.reports.pictures import contact_sheet, scan_figure
 from r2flow.reports.view import most_images, panel_of, write_viewer
-from r2flow.store import MANIFEST, FileStore, read_manifest
+from r2flow.store import MANIFEST, FileStore
 
 # names of their files
 _SAMPLES = re.compile(r"\d{6}\.(ply|bin|npy|png|label|probability\.npz)|samples\.(png|html)")
@@ -131,7 +131,7 @@ def _stale_files(store: FileStore, replace: bool) -> list[Path]:
     files = [file for file in store.folder.glob("*") if _SAMPLES.fullmatch(file.name)]
     note = store.folder / MANIFEST
     if replace and note.is_file():
-        if read_manifest(store.folder, store.kind)["recipe"] != store.described:
+        if store.recipe_there() != store.described:
             return [note, *files]
     elif not store.check() and files:
         raise InputError(

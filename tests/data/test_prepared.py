@@ -28,7 +28,7 @@ from r2flow.data.reading import Reading, read_image
 from r2flow.lidar.labels import COMMON
 from r2flow.lidar.scan_files import write_points
 from r2flow.lidar.sensors import SENSORS, Sensor
-from r2flow.store import MANIFEST, read_manifest
+from r2flow.store import MANIFEST, manifest_of
 from tests.conftest import ROOT, files, find_drives, refused
 from tests.killing import MOMENTS, die_at, in_child
 from tests.training.conftest import TINY, in_process
@@ -435,7 +435,7 @@ def test_nuscenes_has_its_own_sensor_and_scale(r2flow, tmp_path):
         "prepare", f"nuscenes:{path.parent}", "--out", tmp_path / "out", "--workers", 1
     )
     assert (code, error.split("error")[1:]) == (0, [])
-    recipe = read_manifest(tmp_path / "out")["recipe"]["reading"]
+    recipe = manifest_of(tmp_path / "out")["recipe"]["reading"]
     assert {"override /sensor@_global_.sensor": recipe["sensor"]["name"]} in config["defaults"]
     assert recipe["reflectance_scale"] == SOURCES["nuscenes"].reflectance_scale
     image = prepared_in(tmp_path / "out", SENSORS["hdl32e"])[0]

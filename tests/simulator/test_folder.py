@@ -11,7 +11,7 @@ from r2flow.lidar.scan_files import read_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.simulator import simulate
 from r2flow.simulator.folder import SimulatedFolder
-from r2flow.store import read_manifest
+from r2flow.store import manifest_of
 from tests.conftest import files
 
 SMALL = SENSORS["hdl64e"].resized(16, 128)
@@ -73,4 +73,4 @@ def test_the_verb_writes_the_scans_of_any_sensor(r2flow, tmp_path, sensor):
     np.testing.assert_array_equal(
         np.load(tmp_path / "000000.npy"), simulate(sensor.resized(16, 64), 4, 0).image
     )
-    assert read_manifest(tmp_path)["recipe"]["reading"]["sensor"]["name"] == sensor.name
+    assert manifest_of(tmp_path)["recipe"]["reading"]["sensor"]["name"] == sensor.name
