@@ -27,6 +27,7 @@ from r2flow.lidar.scan_files.points import (
     warn_of_unused,
 )
 from r2flow.lidar.scan_files.points import NoPointsError as NoPointsError
+from r2flow.lidar.scan_files.tables import KEPT, state_of
 
 _ROWS = (".pcd.bin", ".bin")  # rows of float32; the one that ends with the other first
 TABLE_ENDINGS = (".pkl.gz", ".pkl")  # PandaSet's frames, and other files of its folders
@@ -75,7 +76,6 @@ FIRM_ENDINGS = tuple(
     ending for ending in SCAN_ENDINGS if ending not in LOOSE_ENDINGS + TABLE_ENDINGS
 )
 
-_KEPT = 4  # files last read, which are looked at several times: for their sensor, their reflectance
 FARTHEST_RAY = 400.0  # metres; no spinning LiDAR measures farther
 LARGEST_FILE = 1 << 30  # bytes: 67 million points, hundreds of scans; more exhausts the memory
 
@@ -112,23 +112,14 @@ def read_cloud(path: str | Path, columns: Sequence[str] | None = None) -> Cloud:
     """All fields of a scan file, as stored; `columns` and errors as of `read_points`."""
     path = Path(path)
     check_columns(columns)
-    cloud = _read_cloud(path, columns and tuple(columns), _state_of(path))
+    cloud = _read_cloud(path, columns and tuple(columns), state_of(path))
     if cloud.named or not beside(path).is_file():
         return cloud
     with reading_errors(path):
         return _with_beside(path, cloud)
 
 
-def _state_of(path: Path) -> tuple[int, ...]:
-    """What changes with a file; empty without one."""
-    try:
-        stat = path.stat()
-    except (OSError, ValueError):  # the reader reports it
-        return ()
-    return stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
-
-
-@lru_cache(_KEPT)
+@lru_cache(KEPT)
 def _read_cloud(path: Path, columns: Sequence[str] | None, state: tuple[int, ...]) -> Cloud:
     ending = scan_ending(path.name)
     if not ending and path.exists():
@@ -241,15 +232,8 @@ def read_range_image(path: str | Path) -> ndarray | None:
 
 def read_numbers(path: str | Path) -> ndarray:
     """The array of numbers in a .npy, of any shape and type, read without unpickling; read-only."""
-    return _read_numbers(Path(path), _state_of(Path(path)))
-
-
-@lru_cache(_KEPT)
-def _read_numbers(path: Path, state: tuple[int, ...]) -> ndarray:
-    with reading(path, LARGEST_FILE, ".npy file"):
-        array = tables.read_array(path)
-    array.flags.writeable = False
-    return array
+    with reading(Path(path), LARGEST_FILE, ".npy file"):
+        return tables.read_array(Path(path))
 
 
 def write_points(

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import IO
 
@@ -28,6 +29,7 @@ class TextForm:
 
 _NUMBER = re.compile(r"(^|[;,\s])[-+]?(\.?\d|nan\b|inf\b)", re.IGNORECASE)
 LARGEST = 1 << 30  # bytes of the points of a compressed file
+KEPT = 4  # files last read, which are looked at several times: for their sensor, their reflectance
 _KITTI = ("x", "y", "z", "reflectance")
 _NUSCENES = ("x", "y", "z", "intensity", "ring")
 _NPY = np.lib.format.MAGIC_PREFIX[:4]
@@ -76,13 +78,31 @@ def _refuse_other_rows(path: Path, width: int) -> None:
             )
 
 
+def state_of(path: Path) -> tuple[int, ...]:
+    """What changes with a file; empty without one."""
+    try:
+        stat = path.stat()
+    except (OSError, ValueError):  # the reader reports it
+        return ()
+    return stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
+
+
 def read_array(path: Path) -> ndarray:
-    """The array of numbers in a .npy, without unpickling or allocating what a header declares."""
+    """The array of numbers in a .npy, read-only, without unpickling or allocating what a header
+    declares.
+    """
+    return _read_array(path, state_of(path))
+
+
+@lru_cache(KEPT)
+def _read_array(path: Path, state: tuple[int, ...]) -> ndarray:
     with np.errstate(over="raise"):
         mapped = np.lib.format.open_memmap(path, mode="r")
     whole = mapped.offset + mapped.nbytes == path.stat().st_size
     check(whole, f"it is longer than its header declares: {mapped.shape}. Is it damaged?")
-    return np.array(mapped)
+    array = np.array(mapped)
+    array.flags.writeable = False
+    return array
 
 
 def read_npy(path: Path) -> Cloud:
