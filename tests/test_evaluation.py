@@ -184,7 +184,7 @@ def test_the_fixed_shuffle_is_stated_and_does_not_change():
     )
     assert fixed_choice(81106, 10000)[:3] == sorted(shuffled[:10000])[:3]
     scans = open_scans("simulated:0", READING, num=10_000)
-    assert Measurer({})._chosen_scans(JSD(), scans) == (range(10_000), "all 10000")
+    assert Measurer({})._scans_for(JSD(), scans) == (range(10_000), "all 10000")
 
 
 class TestSets:

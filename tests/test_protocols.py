@@ -131,9 +131,9 @@ def test_the_paper_s_subset_is_its_own_draw_of_all_scans_with_test_drives_last(
     expected = sorted(theirs[p] for p in place[:5])
     assert _published_choice(scans, 5) == expected
     jsd = METRICS["jsd"]()
-    of_paper = Measurer({}, rules=PAPER)._chosen_scans(jsd, scans)
+    of_paper = Measurer({}, rules=PAPER)._scans_for(jsd, scans)
     assert of_paper == (expected, "5 of 15, Python's shuffle, seed 0")
-    assert Measurer({})._chosen_scans(jsd, scans)[0] != expected
+    assert Measurer({})._scans_for(jsd, scans)[0] != expected
     assert _published_choice(open_scans("simulated:0", READING, num=15), 5) == sorted(place[:5])
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from r2flow.base.errors import InputError, check
 from r2flow.data.described import Described, Spec, describe
-from r2flow.data.options import FOLDER, SourceOptions
+from r2flow.data.options import FOLDER
 from r2flow.data.reading import Reading
 from r2flow.data.sensor_checks import a_few, mismatch_of, readable
 from r2flow.lidar.estimation import estimate_sensor
@@ -43,13 +43,14 @@ def reading_for(
     """
     described = [describe(spec) for spec in scans]
     stored = next((one.stored for one in described if one.stored), None)
-    first = described[0] if described else Described("", SourceOptions(FOLDER))
-    reading = _reading_of(model) if model else stored or Reading(SENSORS[first.kind.sensor])
+    first = described[0] if described else None
+    default = SENSORS[first.kind.sensor if first else "hdl64e"]
+    reading = _reading_of(model) if model else stored or Reading(default)
     if fields.get("columns"):
         fields["columns"] = tuple(fields["columns"])
     fields = {key: value for key, value in fields.items() if value is not None}
     reading = replace(reading, **fields)
-    if described and not (model or stored or sensor):
+    if first and not (model or stored or sensor):
         sensor = _detected(first, reading, estimate_beams)
     target = named_sensor(sensor or reading.sensor, size)
     if model is None:
@@ -63,7 +64,7 @@ def reading_for(
     if scale is not None:
         check(0 < scale < math.inf, f"reflectance_scale must be above 0, found {scale!r}.")
         return reading
-    if not described:
+    if first is None:
         return reading
     trained = reading.reflectance_scale  # 1: also of scans that were scaled before the training
     scale = trained if model and trained != 1 else reading.sensor.reflectance_scale

@@ -145,7 +145,7 @@ class Measurer:
         groups: dict[str, list[str]] = {}  # of metrics, by their choice of scans
         numbers: dict[str, Sequence[int]] = {}
         for name, metric in self.metrics.items():
-            some, choice = self._chosen_scans(metric, real)
+            some, choice = self._scans_for(metric, real)
             if self.cache is not None and real.identity is not None:
                 keys[name] = key_of(metric, real, choice + points)
                 cached = self.cache.read(keys[name])
@@ -166,7 +166,7 @@ class Measurer:
                     self.cache.write(keys[name], found)
         return gathered
 
-    def _chosen_scans(self, metric: ScanMetric, real: ScanSet) -> tuple[Sequence[int], str]:
+    def _scans_for(self, metric: ScanMetric, real: ScanSet) -> tuple[Sequence[int], str]:
         """Numbers of the real scans for a metric, and a description of the choice."""
         count = len(real)
         if metric.protocol.extractor is not None or count <= REAL_SCANS:
