@@ -26,7 +26,7 @@ from r2flow.store import Damaged, Store, checksum
 
 log = logging.getLogger(__name__)
 
-FORMAT = 11  # increment if statistics or figures change for the same scans and protocol
+FORMAT = 12  # increment if statistics or figures change for the same scans and protocol
 # Metrics of single-scan histograms use this many real scans, by a fixed shuffle; metrics of
 # features use all.
 REAL_SCANS = 10_000
@@ -241,7 +241,7 @@ class Measurer:
                     last = images
                 empty += int((~batch.nonempty).sum())
                 for metric in metrics:
-                    metric.update(batch, real, share)
+                    metric.update(batch, real)
                 advance(len(images))
         return _of_all_processes(empty)
 

@@ -93,48 +93,43 @@ class ScanMetric(Metric):
         """Numbers of each scan, (B, D); NaN for a scan without anything to compare."""
 
     @abstractmethod
-    def accumulate(self, rows: Tensor, numbers: Tensor, side: int) -> None:
-        """Add finite rows, of scans with these numbers, to the states of a side."""
+    def accumulate(self, rows: Tensor, side: int) -> None:
+        """Add finite rows to the states of a side."""
 
     @abstractmethod
     def figures(self) -> Figures:
         """Compute values by name from the states, and append to `remarks`."""
 
-    def update(
-        self, scans: Scans | Tensor, real: bool, numbers: Sequence[int] | None = None
-    ) -> None:
+    def update(self, scans: Scans | Tensor, real: bool) -> None:
         """Add a batch of real or generated scans.
 
         Args:
             scans: `Scans`, or images (B, 2 or 1, H, W) of the metric's `sensor`: range in metres,
                 reflectance in [0, 1], 0 without a return. Metrics of the same network run it once
                 per `Scans` object.
-            numbers: Numbers of the scans: stored rows are sorted by number, so that values do not
-                depend on the order of batches. Default: counted from the number of scans so far.
 
         Raises:
             InputError: Images without a sensor, with impossible values, or without the reflectance
                 that the metric needs.
         """
-        if numbers is None:
-            first = int(self.counts[0 if real else 1, 0])
-            numbers = range(first, first + len(scans))
         if isinstance(scans, Tensor):
             if self.sensor is None:
                 raise InputError(f"'{self.name}' needs the sensor of images: pass sensor='hdl64e'.")
+            first = int(self.counts[0 if real else 1, 0])
+            numbers = range(first, first + len(scans))
             scans = Scans(scans.to(self.device), self.sensor, names=numbers)
         if self.needs_reflectance and not scans.has_reflectance:
             raise InputError(
                 f"'{self.name}' needs reflectance, which these scans do not have; leave it out."
             )
         if len(scans):
-            self._add_rows(self.rows(scans), real, numbers)
+            self._add_rows(self.rows(scans), real)
 
-    def _add_rows(self, rows: Tensor, real: bool, numbers: Sequence[int]) -> None:
-        """Add the rows of scans of these numbers to the states."""
+    def _add_rows(self, rows: Tensor, real: bool) -> None:
+        """Add the rows of scans to the states."""
         side = 0 if real else 1
         whole = rows.isfinite().all(1)
-        self.accumulate(rows[whole], torch.tensor(numbers, device=rows.device)[whole], side)
+        self.accumulate(rows[whole], side)
         self.counts[side, 0] += len(rows)
         self.counts[side, 1] += int(whole.sum())
 
@@ -193,7 +188,7 @@ class SumMetric(ScanMetric):
     def figures_of(self, real: ndarray, generated: ndarray) -> Figures:
         """Compute values from the two sums of rows, (width,) each; zeros without any rows."""
 
-    def accumulate(self, rows: Tensor, numbers: Tensor, side: int) -> None:
+    def accumulate(self, rows: Tensor, side: int) -> None:
         self.sums[side] += rows.sum(0, dtype=torch.float64).to(self.sums)
 
     def figures(self) -> Figures:
@@ -207,7 +202,7 @@ class StoredMetric(ScanMetric):
     """A metric of all rows of both sets, which are stored in float32."""
 
     fewest: int = 2  #: minimum number of scans per set
-    #: N times a scan number and its row; flat, since a process without rows has no width.
+    #: Rows one after another; flat, since a process without rows has no width.
     real_rows: list[Tensor]
     generated_rows: list[Tensor]
 
@@ -216,10 +211,9 @@ class StoredMetric(ScanMetric):
         self.add_state("real_rows", [], "cat")
         self.add_state("generated_rows", [], "cat")
 
-    def accumulate(self, rows: Tensor, numbers: Tensor, side: int) -> None:
+    def accumulate(self, rows: Tensor, side: int) -> None:
         stored = (self.real_rows, self.generated_rows)[side]
-        numbered = torch.cat([numbers[:, None], rows], 1)
-        stored.append(numbered.flatten().float().to(self.device))
+        stored.append(rows.flatten().float().to(self.device))
 
     @property
     def labels(self) -> list[str]:
@@ -235,21 +229,13 @@ class StoredMetric(ScanMetric):
         if min(real, generated) < self.fewest:
             self.remarks.append(f"{self.name} needs {self.fewest} or more scans of each set.")
             return dict.fromkeys(self.labels, float("nan"))
-        sets = (_table(self.real_rows, real), _table(self.generated_rows, generated))
-        return dict(zip(self.labels, self.values(*sets), strict=True))
+        rows = _joined(self.real_rows).cpu().view(real, -1)
+        others = _joined(self.generated_rows).cpu().view(generated, -1)
+        return dict(zip(self.labels, self.values(rows, others), strict=True))
 
 
 def _joined(rows: list[Tensor] | Tensor) -> Tensor:
-    """Stored rows as one tensor, (N * (1 + D),); not copied if they are one already."""
+    """Stored rows as one tensor, (N D,); not copied if they are one already."""
     if isinstance(rows, Tensor):  # gathered from all processes
         return rows
     return rows[0] if len(rows) == 1 else torch.cat(rows or [torch.zeros(0)])
-
-
-def _table(rows: list[Tensor] | Tensor, count: int) -> Tensor:
-    """Stored rows in the order of scans, (N, D) float32 on the CPU."""
-    table = _joined(rows).cpu().view(count, -1)
-    order = table[:, 0].argsort(stable=True)
-    if (order.diff() != 1).any():  # else not copied: there may be no room for all rows twice
-        table = table[order]
-    return table[:, 1:]

@@ -61,7 +61,7 @@ class JSDLiDM(JSD):
             rows.append(cells if len(cells) else cells.new_full((1,), torch.nan))
         return pad_sequence(rows, True, self.width)
 
-    def accumulate(self, rows: Tensor, numbers: Tensor, side: int) -> None:
+    def accumulate(self, rows: Tensor, side: int) -> None:
         cells = rows[rows < self.width].long().to(self.sums.device)
         self.sums[side] += cells.bincount(minlength=self.width)
 

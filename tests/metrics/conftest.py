@@ -76,7 +76,7 @@ def measured(metric: ScanMetric, real: Scans, generated: Scans) -> ScanMetric:
 
 def given(metric: ScanMetric, real: ArrayLike, generated: ArrayLike) -> dict[str, float]:
     for rows, is_real in ((real, True), (generated, False)):
-        metric._add_rows(torch.as_tensor(rows).flatten(1), is_real, range(len(rows)))
+        metric._add_rows(torch.as_tensor(rows).flatten(1), is_real)
     return metric.compute()
 
 

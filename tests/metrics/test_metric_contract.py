@@ -39,7 +39,7 @@ def give(metric, sets, size=4, order=1):
     for side, scans in sets.items():
         for first in range(0, len(scans), size)[::order]:
             numbers = range(len(scans))[first : first + size]
-            metric.update(part(scans, numbers), side == "real", numbers)
+            metric.update(part(scans, numbers), side == "real")
     return metric
 
 
@@ -64,7 +64,7 @@ def test_figures_do_not_depend_on_processes_or_the_order_of_scans(build, sets, p
     for side, scans in sets.items():
         for k, first in enumerate(range(0, len(scans), 2)):
             numbers = range(len(scans))[first : first + 2]
-            ranks[k % processes].update(part(scans, numbers), side == "real", numbers)
+            ranks[k % processes].update(part(scans, numbers), side == "real")
     # put together as torchmetrics does it, in the first one
     for name, reduce in ranks[0]._reductions.items():
         values = [getattr(one, name) for one in ranks]
