@@ -46,10 +46,11 @@ class ScanFiles(ScanSource):
 
     @property
     def names(self) -> list[str]:
-        return list(map(self._name, self.paths))
+        return [str(path).removeprefix(self._root) for path in self.paths]
 
-    def _name(self, path: str | Path) -> str:
-        return str(path).removeprefix(os.path.join(self.root, ""))
+    @cached_property
+    def _root(self) -> str:
+        return os.path.join(self.root, "")
 
     def subset(self, indices: Sequence[int]) -> "ScanFiles":
         paths = [self.paths[i] for i in indices]
@@ -96,7 +97,8 @@ class ScanFiles(ScanSource):
             with suppress(OSError):  # reported when the scan is read
                 stat = os.stat(path)
                 changes = (getattr(stat, time) for time in times)
-                listed.append([self._name(path), stat.st_size, *changes])
+                name = str(path).removeprefix(self._root)
+                listed.append([name, stat.st_size, *changes])
         return listed
 
     def places(self) -> set[str]:
