@@ -73,7 +73,6 @@ def completed_cloud(
             np.concatenate(pair).astype(pair[0].dtype, copy=False)
             for pair in zip(cloud.columns, new, strict=True)
         ),
-        shape=None,
     )
     measured = len(cloud)
     more: dict[str, ndarray] = {

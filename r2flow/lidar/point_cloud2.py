@@ -3,6 +3,7 @@
 https://docs.ros.org/en/api/sensor_msgs/html/msg/PointCloud2.html
 """
 
+import math
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -39,8 +40,7 @@ class Scan:
         """The message with other points: its header, and its fields at their places.
 
         New fields follow, in their order; the list of fields has the order of offsets, rows are
-        not padded, and numbers are little-endian, since readers ignore all three. The height is 1
-        unless the cloud is a grid.
+        not padded, and numbers are little-endian, since readers ignore all three. The height is 1.
 
         Raises:
             InputError: A field has a type that a PointCloud2 cannot hold, or two have one name.
@@ -127,7 +127,6 @@ def cloud_of(path: Path, message: Any) -> Cloud:
     return Cloud(
         tuple(field.name for field in fields),
         tuple(table[name] for name in table.dtype.names or ()),
-        shape=shape if message.height > 1 else None,
     )
 
 
@@ -139,24 +138,22 @@ def _lies_within(field: Any, step: int) -> bool:
 def _serialized(message: Any, cloud: Cloud, encoding: str) -> bytes:
     store = type_store(encoding)
     rows = _laid_out(cloud.array(), message)
-    height, width = cloud.shape or (1, len(rows))
     step = rows.dtype.itemsize
     field = store.types["sensor_msgs/msg/PointField"]
-    fields = []
-    for name, (kind, offset, *_) in (rows.dtype.fields or {}).items():
-        one, shape = kind.subdtype or (kind, ())
-        fields.append(field(name, offset, _DATATYPES[one.str[1:]], int(np.prod(shape, dtype=int))))
-    finite = all(
-        np.isfinite(rows[axis]).all() for axis in "xyz" if axis in (rows.dtype.fields or {})
-    )
+    layout = rows.dtype.fields or {}
+    fields = [
+        field(name, offset, _DATATYPES[kind.base.str[1:]], math.prod(kind.shape))
+        for name, (kind, offset, *_) in layout.items()
+    ]
+    finite = all(np.isfinite(rows[axis]).all() for axis in "xyz" if axis in layout)
     new = replace(
         message,
         fields=fields,
-        height=height,
-        width=width,
+        height=1,
+        width=len(rows),
         is_bigendian=False,
         point_step=step,
-        row_step=step * width,
+        row_step=step * len(rows),
         data=rows.view(np.uint8) if len(rows) else np.empty(0, np.uint8),
         is_dense=finite,
     )

@@ -22,7 +22,6 @@ class Cloud:
     names: tuple[str, ...]  # of the fields; of rows without names those that say what they are
     columns: tuple[ndarray, ...]  # (N,) or (N, count) each, of the stored type and byte order
     aliases: tuple[str, ...] = ()  # names that say what the fields are, if others than `names`
-    shape: tuple[int, int] | None = None  # (height, width) of an organised cloud, else None
     header: Any = None  # what a writer of the format needs besides: PCD's viewpoint, LAS's header
     held: int | None = None  # how many fields the rows hold of a format without names, as a .bin
 
@@ -37,9 +36,8 @@ class Cloud:
         if array.dtype.names is None:
             names = ("x", "y", "z", "reflectance")[: array.shape[1]]
             return cls(names, tuple(array.T), held=len(names))
-        shape = array.shape if array.ndim == 2 else None
         rows = array.ravel()
-        return cls(array.dtype.names, tuple(rows[name] for name in array.dtype.names), (), shape)
+        return cls(array.dtype.names, tuple(rows[name] for name in array.dtype.names))
 
     @property
     def named(self) -> bool:
@@ -100,10 +98,10 @@ class Cloud:
         return self.take(np.flatnonzero(column != 0))
 
     def take(self, rows: ndarray) -> "Cloud":
-        """Some rows, by their ascending numbers; they are no grid any more."""
+        """Some rows, by their ascending numbers."""
         if len(rows) == len(self):
             return self
-        return replace(self, columns=tuple(column[rows] for column in self.columns), shape=None)
+        return replace(self, columns=tuple(column[rows] for column in self.columns))
 
     def with_reflectance(self, values: ndarray) -> "Cloud":
         """The cloud with other values of reflectance, in the type of its field; a field `intensity`

@@ -69,12 +69,10 @@ def read_pcd(path: Path) -> Cloud:
         columns = _decompressed(path, body, row, count)
     else:
         columns = _columns(body, row, count, encoding)
-    wide, high = (int(header.get(key, ["0"])[0]) for key in ("WIDTH", "HEIGHT"))
     kept = [place for place, (name, *_) in enumerate(stored) if name != PADDING]
     return Cloud(
         tuple(stored[place][0] for place in kept),
         tuple(columns[place] for place in kept),
-        shape=(high, wide) if high > 1 and high * wide == count else None,
         header=header.get("VIEWPOINT"),
     )
 
@@ -127,12 +125,8 @@ def read_ply(path: Path) -> Cloud:
     row = np.dtype([(str(number), code) for number, code in enumerate(codes)])
     names = tuple(name.strip() for _, name in properties)
     columns = tuple(_columns(body, row, int(count), encoding, last=not others))
-    # Stanford's way of an organised cloud.
-    sides = re.findall(r"^obj_info num_(?:rows|cols) (\d+)$", head, re.MULTILINE)
-    height, width = map(int, sides) if len(sides) == 2 else (0, 0)
-    grid = (height, width) if height * width == int(count) and height > 1 else None
     comments = tuple(re.findall(r"^comment (.*\S)", text, re.MULTILINE))
-    return Cloud(names, columns, shape=grid, header=comments)
+    return Cloud(names, columns, header=comments)
 
 
 def write_ply(file: IO[bytes], cloud: Cloud) -> None:
@@ -143,14 +137,9 @@ def write_ply(file: IO[bytes], cloud: Cloud) -> None:
         held = PLY_TYPES.get(kind.str[1:])
         _check_type(name, kind, "PLY", held, "integers of 1, 2, 4 bytes and floats of 4, 8")
         properties.append(f"property {held} {name}\n")
-    lines = [f"comment {line}\n" for line in cloud.header or ()]
-    if cloud.shape:
-        lines += [
-            f"obj_info num_{side} {n}\n"
-            for side, n in zip(("rows", "cols"), cloud.shape, strict=True)
-        ]
+    comments = "".join(f"comment {line}\n" for line in cloud.header or ())
     file.write(
-        f"ply\nformat binary_little_endian 1.0\n{''.join(lines)}element vertex {len(rows)}\n"
+        f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {len(rows)}\n"
         f"{''.join(properties)}end_header\n".encode()
     )
     file.write(rows.tobytes())
