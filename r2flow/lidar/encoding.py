@@ -1,7 +1,7 @@
 """Model space: range images encoded, [-1, 1], and decoded to metres and points."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -21,90 +21,13 @@ from r2flow.base.registry import (
 )
 from r2flow.lidar.labels import COMMON
 from r2flow.lidar.projection import image_to_points
+from r2flow.lidar.range_formats import FORMATS
 from r2flow.lidar.sensors import Sensor, build_sensor
 
 LIMIT_TOLERANCE = 1e-5  # relative, of closed range limits in decoding, for float32's rounding
 FULL = 1 + 1e-3  # maximum reflectance; larger values mean another scale
 LEAST = 0.05  # probability of a decoded label; all planes of a ray without label are -1
 FAR = 300.0  # metres, above any scan's median range, unless its sensor has a larger limit
-
-
-class RangeFormat:
-    """Maps ranges r in metres, (..., 1, H, W), to values y in [0, 1] and back: r / r_max."""
-
-    def __init__(self, sensor: Sensor) -> None:
-        self.min_range = sensor.min_range
-        self.max_range = sensor.max_range
-
-    def forward(self, r: Tensor) -> Tensor:
-        return r / self.max_range
-
-    def inverse(self, y: Tensor) -> Tensor:
-        return y * self.max_range
-
-
-class LogScale(RangeFormat):
-    """log2(r + 1) / log2(r_max + 1), the paper's eq. 5: finer near the sensor."""
-
-    def __init__(self, sensor: Sensor) -> None:
-        self.scale = math.log2(sensor.max_range + 1)
-
-    def forward(self, r: Tensor) -> Tensor:
-        return torch.log2(r + 1) / self.scale
-
-    def inverse(self, y: Tensor) -> Tensor:
-        return torch.exp2(y * self.scale) - 1
-
-
-class ShiftedLog(LogScale):
-    """log2(r + 1.0001) / scale, with scale = log2(r_max + 1) rounded up to hundredths.
-
-    Used by LiDARGen (r_max 63 m, scale 6) and LiDM (56 m, 5.84). A ray without return is
-    log2(1.0001) / scale, not exactly 0; the inverse, 2^(scale y) - 1, keeps the offset of 0.1 mm.
-    """
-
-    def __init__(self, sensor: Sensor) -> None:
-        self.scale = math.ceil(100 * math.log2(sensor.max_range + 1) - 1e-9) / 100
-
-    def forward(self, r: Tensor) -> Tensor:
-        return super().forward(r.clamp(min=0) + 1e-4)
-
-    def inverse(self, y: Tensor) -> Tensor:
-        return super().inverse(y.clamp(0, 1))
-
-
-class Inverse(RangeFormat):
-    """r_min / r, 0 for no return.
-
-    float32 resolves r to r^2 / r_min 2^-26: 2 mm for limits of 0.3 and 200 m.
-    """
-
-    def forward(self, r: Tensor) -> Tensor:
-        return torch.where(r > 0, self.min_range / r.clamp(min=1e-12), 0.0)
-
-    inverse = forward  # type: ignore[assignment]
-
-
-class InverseDepth(Inverse):
-    """r_min / r within the range limits, else 0, in both directions, as in DUSty: no tolerance."""
-
-    def forward(self, r: Tensor) -> Tensor:
-        return torch.where((r >= self.min_range) & (r <= self.max_range), super().forward(r), 0.0)
-
-    def inverse(self, y: Tensor) -> Tensor:
-        inverse = y / self.min_range
-        inside = (inverse >= 1 / self.max_range) & (inverse <= 1 / self.min_range)
-        return torch.where(inside, super().inverse(y), 0.0)
-
-
-FORMATS: Registry[Callable[[Sensor], RangeFormat]] = Registry(
-    "range format",
-    logscale=LogScale,
-    shifted_log=ShiftedLog,
-    inverse=Inverse,
-    inverse_depth=InverseDepth,
-    metric=RangeFormat,
-)
 
 
 class Encoding:

@@ -140,7 +140,7 @@ def _serialized(message: Any, cloud: Cloud, encoding: str) -> bytes:
     rows = _laid_out(cloud.array(), message)
     step = rows.dtype.itemsize
     field = store.types["sensor_msgs/msg/PointField"]
-    layout = rows.dtype.fields or {}
+    layout: Any = rows.dtype.fields or {}
     fields = [
         field(name, offset, _DATATYPES[kind.base.str[1:]], math.prod(kind.shape))
         for name, (kind, offset, *_) in layout.items()

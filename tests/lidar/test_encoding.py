@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.lidar.encoding import FORMATS, Encoding, ModelSpace
+from r2flow.lidar.encoding import Encoding, ModelSpace
 from r2flow.lidar.projection import image_to_points, project
+from r2flow.lidar.range_formats import FORMATS
 from r2flow.lidar.sensors import SENSORS, Sensor, build_sensor
 
 HDL64E = SENSORS["hdl64e"]

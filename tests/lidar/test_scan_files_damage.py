@@ -19,7 +19,7 @@ from tests.conftest import memory_below
 pytestmark = pytest.mark.filterwarnings("error")
 
 # small, so that every cut and every header bit can be tried; 16 divides 20 COUNT and 12 COUNT
-COUNT = 64
+COUNT = 16
 RNG = np.random.default_rng(7)
 XYZ = np.round(RNG.standard_normal((COUNT, 3)) * [20, 20, 2], 2).astype(np.float32)
 REFLECTANCE = np.round(RNG.random(COUNT), 2).astype(np.float32)
@@ -181,8 +181,8 @@ def layouts() -> dict[str, bytes]:
         "rows of 5": np.column_stack([TABLE, RING]).tobytes(),
         "noise": np.random.default_rng(0).bytes(1 << 16),
         "zeros": bytes(1024),
-        "NaN": np.full((64, 4), np.nan, "<f4").tobytes(),
-        "mostly NaN": np.where(np.arange(COUNT)[:, None] < 40, np.nan, TABLE)
+        "NaN": np.full((COUNT, 4), np.nan, "<f4").tobytes(),
+        "mostly NaN": np.where(np.arange(COUNT)[:, None] < 0.6 * COUNT, np.nan, TABLE)
         .astype("<f4")
         .tobytes(),
         "map coordinates": (TABLE + np.float32([450000, 5400000, 110, 0])).tobytes(),
@@ -274,7 +274,7 @@ WRONG = {
     "no format": ("ply", ply_ascii().replace(b"format ascii 1.0\n", b"")),
     "a list": ("ply", ply_ascii().replace(b"property float x", b"property list uchar float x")),
     "unknown property": ("ply", ply_ascii().replace(b"float x", b"long x")),
-    "a negative count": ("ply", ply_ascii().replace(b"vertex 64", b"vertex -4")),
+    "a negative count": ("ply", ply_ascii().replace(f"vertex {COUNT}".encode(), b"vertex -4")),
 }
 
 

@@ -20,12 +20,7 @@ from r2flow.base.errors import IN_MEMORY, InputError, check, naming, warn_odd
 from r2flow.base.files import atomic_write, reading, reading_errors
 from r2flow.lidar.scan_files import clouds, pandaset, samples, tables
 from r2flow.lidar.scan_files.cloud import Cloud
-from r2flow.lidar.scan_files.points import (
-    FARTHEST,
-    Points,
-    check_columns,
-    warn_of_unused,
-)
+from r2flow.lidar.scan_files.points import FARTHEST, Points, check_columns, warn_of_unused
 from r2flow.lidar.scan_files.points import NoPointsError as NoPointsError
 from r2flow.lidar.scan_files.tables import KEPT, state_of
 
@@ -146,8 +141,8 @@ def _with_beside(path: Path, cloud: Cloud) -> Cloud:
     """The cloud with the fields in the file beside it."""
     with np.load(beside(path)) as stored:
         fields = {name: stored[name] for name in stored.files}
-    if any(column.shape[:1] != (len(cloud),) for column in fields.values()):
-        raise InputError(f"{beside(path)} is not of its {len(cloud)} points: move it elsewhere.")
+    whole = all(column.shape[:1] == (len(cloud),) for column in fields.values())
+    check(whole, f"{beside(path)} is not of its {len(cloud)} points: move it elsewhere.")
     return cloud.with_fields(fields)
 
 
@@ -214,8 +209,7 @@ def read_range_image(path: str | Path) -> ndarray | None:
     count = int(np.count_nonzero(wrong))
     found = ranges[wrong]
     # one value alone, as -1, stands for no return, however many have none
-    several = count and (found != found[0]).any()
-    if several and 2 * count > np.count_nonzero(ranges):
+    if count and (found != found[0]).any() and 2 * count > np.count_nonzero(ranges):
         raise InputError(
             f"{path}: most of its ranges are below 0 or above {FARTHEST_RAY:g} m, from "
             f"{found.min():.3g} to {found.max():.3g}. Are these millimetres, or a scan in model "

@@ -16,7 +16,7 @@ from torch import Tensor
 from r2flow.base.errors import InputError
 from r2flow.base.files import parse_yaml, reading_errors
 from r2flow.base.registry import Config, Options
-from r2flow.lidar.encoding import ShiftedLog
+from r2flow.lidar.range_formats import ShiftedLog
 from r2flow.lidar.sensors import build_sensor
 from r2flow.model.published import Format, Published
 from r2flow.systems.latent.autoencoder import UP
