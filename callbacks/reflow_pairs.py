@@ -19,11 +19,11 @@ class ReflowPairs(L.Callback):
         data = trainer.datamodule
         if not isinstance(data, ScanDataModule) or data.pairs is None:
             return
-        if data.pairs.of is None and not pl_module.hparams.get("parent"):
+        record = pl_module.parent
+        if data.pairs.of is None and record is None:
             raise InputError(
                 "pairs are drawn by a trained flow: give the stage a parent, or pairs={'of': RUN}."
             )
-        record = pl_module.hparams["parent"]
         own = pl_module.backbone if pl_module.own_network else None
         if data.pairs.of:
             record = find_parent(data.pairs.of, own).record()
@@ -32,5 +32,5 @@ class ReflowPairs(L.Callback):
         if store.missing_pairs():
             # File locks, not a barrier: collective calls time out after half an hour, and a slow
             # rank may take longer.
-            flow = load_checkpoint(record["path"], backbone=own).generator
+            flow = load_checkpoint(record.path, backbone=own).generator
             make_pairs(store, flow.to(trainer.strategy.root_device))

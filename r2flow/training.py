@@ -122,7 +122,7 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
         log_config(run.trainer.loggers, run.config.plain())
     try:
         validates = is_overridden("validation_step", run.stage)
-        if last is None and run.stage.hparams["parent"] and validates:
+        if last is None and run.stage.parent and validates:
             # What the end of the run is compared with.
             run.trainer.validate(run.stage, run.data, verbose=False)
         run.trainer.fit(run.stage, run.data, ckpt_path=last, weights_only=True)

@@ -116,7 +116,7 @@ def write_run(folder: Path, flow: Checkpoint, stage: dict[str, Any], scale: floa
         "few": None,
         "seed": 0,
         "generator": {"name": "rectified_flow"},
-        **flow.config,
+        **flow.config.stored,
     }
     model = {key: options[key] for key in (*MODEL, "sampler", "few", "seed")}
     content = {
@@ -127,7 +127,7 @@ def write_run(folder: Path, flow: Checkpoint, stage: dict[str, Any], scale: floa
             **model,
             **{key: value for key, value in stage.items() if key != "name"},
         },
-        "datamodule_hyper_parameters": flow.config.get("data", {}),
+        "datamodule_hyper_parameters": flow.config.stored.get("data", {}),
         "r2flow": {
             "stage": stage["name"],
             "plugins": [],

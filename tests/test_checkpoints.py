@@ -38,7 +38,7 @@ def test_the_averaged_weights_are_the_model(saved):
 def test_a_published_checkpoint_computes_what_its_authors_did(shared):
     loaded = load_checkpoint(shared / "oracle" / "published_format.pth")
     case = torch.load(shared / "oracle" / "hdit_16x192.pt", weights_only=False)
-    assert (loaded.format, loaded.config["stage"]) == ("published", {"name": "rectify"})
+    assert (loaded.format, loaded.config.stage.name) == ("published", "rectify")
     assert loaded.sensor.shape == (16, 192)
     with torch.no_grad():
         output = loaded.model(case["t"], case["x"])
@@ -238,7 +238,7 @@ def test_an_unfolding_distilled_checkpoint_brings_its_ring_angles_and_steps(shar
     assert (
         loaded.generator.sampler.steps,
         loaded.generator.fixed,
-        loaded.config["stage"]["steps"],
+        loaded.config.stage.options["steps"],
     ) == (2, True, 2)
 
 
@@ -291,7 +291,7 @@ def test_what_was_trained_without_a_run_is_saved_and_loaded(tmp_path: Path):
     torch.testing.assert_close(
         loaded.generator.state_dict(), mine.generator.state_dict(), rtol=0, atol=0
     )
-    assert loaded.config == config
+    assert loaded.config.stored == config
     mine.generator.backbone = torch.compile(mine.generator.backbone)
     for half in (False, True):
         save_checkpoint(mine, tmp_path / "compiled.safetensors", half)

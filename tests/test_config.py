@@ -262,7 +262,7 @@ def test_a_chosen_backbone_is_whole_at_every_size(backbone: str):
 @pytest.mark.parametrize("asked", ["backbone=hdit_small", "backbone.depths=[1]"])
 def test_a_backbone_for_a_system_with_its_own_network_is_refused(asked: str):
     command = ["experiment=vanilla_gan", "size=small"]
-    gan = check(compose(command), command).plain()
+    gan = check(compose(command), command).model_config()
     with pytest.raises(InputError, match=r"stage\.parent names a run without a backbone"):
         check(compose(["stage=flow_map", "data=pairs"]), parent=Parent(gan, Path("gan")))
     with pytest.raises(InputError, match="stage=gan has its own network: leave the backbone out"):

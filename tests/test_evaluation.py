@@ -217,7 +217,7 @@ class TestSets:
             for more in ({"reflectance_scale": 255.0}, {})
         ]
         learned = flow()
-        learned.config["data"] = {"name": "mixed", "parts": parts}
+        learned.config.stored["data"] = {"name": "mixed", "parts": parts}
         found = reading_for([], learned)
         assert (found.projection, found.convention, found.reflectance_scale) == (
             "spherical",

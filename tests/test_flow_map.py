@@ -15,6 +15,7 @@ from r2flow.data.pairs import PairDataset, PairStore, make_pairs
 from r2flow.flow.maps import OBJECTIVES
 from r2flow.flow.problems import Gaussian
 from r2flow.generators import FlowMap, RectifiedFlow, build_generator
+from r2flow.model.config import ModelConfig
 from r2flow.model.lineage import Parent, model_options
 from r2flow.samplers import build_sampler
 from r2flow.stages import STAGES
@@ -91,7 +92,7 @@ def test_a_flow_that_goes_on_from_a_map_has_its_velocity():
                                              ("distill", "rectified_flow"), ("flow_map", "flow_map"),
                                              ("transfer", "transfer_flow")])  # fmt: skip
 def test_what_a_stage_makes_of_a_map(stage, made):
-    of_map = Parent({**CONFIG, "generator": {"name": "flow_map"}}, Path("x"))
+    of_map = Parent(ModelConfig({**CONFIG, "generator": {"name": "flow_map"}}), Path("x"))
     assert model_options({}, of_map, STAGES[stage].generator_name)["generator"] == {"name": made}
 
 

@@ -14,6 +14,7 @@ from r2flow.data.options import DataOptions
 from r2flow.data.resolving import plan_data
 from r2flow.generators import build_generator
 from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.config import ModelConfig
 from r2flow.model.lineage import Parent, find_parent
 from r2flow.model.saving import weights_hash
 from r2flow.runs.composing import compose
@@ -212,7 +213,8 @@ def test_each_set_of_scans_says_its_whole_reading():
 
 def parent_of(reading: dict, path: Path) -> Parent:
     there = find_parent(path)
-    return replace(there, config={**there.config, "data": {"name": "folder", "reading": reading}})
+    data = {"name": "folder", "reading": reading}
+    return replace(there, config=ModelConfig({**there.config.stored, "data": data}))
 
 
 def test_scans_in_files_become_the_images_that_the_parent_has_learned(parent: Path):

@@ -20,7 +20,7 @@ from pathlib import Path
 from traceback import walk_tb
 
 from r2flow.base.errors import InputError, check
-from r2flow.base.registry import Options, Registry, UnknownName
+from r2flow.base.registry import Registry, UnknownName
 
 GROUP = "r2flow.plugins"
 
@@ -113,14 +113,12 @@ Registry.on_missing.append(load_installed)
 
 
 @contextmanager
-def made_with(config: Options, what: str) -> Iterator[None]:
-    """Add the plug-ins that may define an unknown name of a stored config to the error; `what` is
-    its owner.
-    """
+def made_with(plugins: Sequence[str], what: str) -> Iterator[None]:
+    """Add the plug-ins that may define an unknown name to the error; `what` was made with them."""
     try:
         yield
     except UnknownName as error:
-        missing = [name for name in config.get("plugins") or () if _identity(name) not in _loaded]
+        missing = [name for name in plugins if _identity(name) not in _loaded]
         if not missing:
             raise
         give = " ".join(f"--plugin {name}" for name in missing)

@@ -98,7 +98,7 @@ def ablate(
     missing = [run for run in ablation.runs if run not in done]
     if missing:
         first = ablation.first()
-        model = Checkpoint(first.stage.generator, first.config.plain())
+        model = Checkpoint(first.stage.generator, first.config.model_config())
         scans = open_scans(held_out, reading_for([held_out], model), num=num)
         source: Any = first.data.training_source
         training = ScanSet("training scans", source, scans.sensor)

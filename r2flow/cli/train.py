@@ -84,8 +84,8 @@ def pairs(
         "batch_size": batch_size,
         "shard_mib": shard_mib,
         "seed": seed,
-        "parent": record["weights"],
-        "first": record["first_pair"],
+        "parent": record.weights,
+        "first": record.first_pair,
     }
     chosen = construct("pairs", PairOptions, options)
     folder = out or default_folder(flow.path)

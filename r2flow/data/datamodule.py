@@ -33,6 +33,7 @@ from r2flow.data.options import (
     SIMULATED,
     DataOptions,
     PairOptions,
+    ParentRecord,
     ReadingOptions,
     ValidationOptions,
 )
@@ -185,14 +186,14 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
         """
         return self.item_format or ItemFormat(self.encoding, self.encoding.shape)
 
-    def drawn_by(self, parent: Mapping[str, Any]) -> None:
+    def drawn_by(self, parent: ParentRecord) -> None:
         """Complete the identity of the pairs by the record of the flow that draws them
         (`Parent.record`).
         """
         assert self.pairs is not None
-        first = parent["first_pair"] if self.pairs.first is None else self.pairs.first
-        pairs = replace(self.pairs, parent=parent["weights"], first=first)
-        root = self.options.root or parent["pairs"]
+        first = parent.first_pair if self.pairs.first is None else self.pairs.first
+        pairs = replace(self.pairs, parent=parent.weights, first=first)
+        root = self.options.root or parent.pairs
         self.options = replace(self.options, root=root, pairs=pairs)
         self.save_hyperparameters(self.described(), logger=False)
 

@@ -8,8 +8,9 @@ from dataclasses import replace
 from typing import Any
 
 from r2flow.base.errors import InputError, check
+from r2flow.base.registry import construct
 from r2flow.data.described import Described, Spec, describe
-from r2flow.data.options import FOLDER
+from r2flow.data.options import FOLDER, PartOptions
 from r2flow.data.reading import Reading
 from r2flow.data.sensor_checks import a_few, mismatch_of, readable
 from r2flow.lidar.estimation import estimate_sensor
@@ -105,11 +106,12 @@ def _reading_of(model: Any) -> Reading:
     """How a model's training scans became images; for a mixture, the fields on which all parts
     agree.
     """
-    data = model.config.get("data", {})
-    first, *others = [part.get("reading") or {} for part in data.get("parts") or [data]]
+    data = model.config.data
+    parts = [construct("data.parts", PartOptions, part) for part in data.parts or ()]
+    first, *others = [part.reading_fields for part in parts or [data]]
     agreed = {
         key: first[key]
         for key in ("projection", "convention", "reflectance_scale")
-        if first.get(key) is not None and all(other.get(key) == first[key] for other in others)
+        if key in first and all(other.get(key) == first[key] for other in others)
     }
     return Reading(model.sensor, **agreed)

@@ -102,6 +102,18 @@ class ValidationOptions:
     data: Annotated[Options | None, SourceOptions, Rule(links="scans")] = None
 
 
+@dataclass(frozen=True)
+class ParentRecord:
+    """Identity of the model that a run starts from, as its checkpoints store it."""
+
+    path: Free[str] = ""
+    weights: str | None = None  # hash of the averaged weights; None: not trained yet
+    step: int = 0
+    stage: str | None = None
+    first_pair: int = 0  # the first pair whose noise the model was not trained on
+    pairs: Free[str] = ""  # default folder of its pairs
+
+
 @strict
 @dataclass(frozen=True)
 class PairOptions:

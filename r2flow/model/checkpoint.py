@@ -31,6 +31,7 @@ from r2flow.lidar.scan_files import Points, points_in_memory
 from r2flow.lidar.sensors import Sensor, named_sensor
 from r2flow.model.completer import Completer
 from r2flow.model.completion import complete
+from r2flow.model.config import ModelConfig
 from r2flow.model.parts import HYPER, NOTES, PREFIX, config_of
 from r2flow.model.paths import find_checkpoint, title_of
 from r2flow.model.published import FORMATS
@@ -48,15 +49,14 @@ class Checkpoint:
 
     Attributes:
         generator: The generator with its averaged weights, in eval mode.
-        config: The training config, as plain dicts; `build_generator(config)` builds the same
-            architecture.
+        config: The config of its training; given as plain dicts, it becomes a `ModelConfig`.
         step: Optimiser steps taken.
         path: File that it was read from.
         format: `r2flow`, or `published` for files of the original implementations.
     """
 
     generator: Generator
-    config: dict[str, Any]
+    config: ModelConfig
     step: int = 0
     path: Path = Path("unsaved")
     format: str = "r2flow"
@@ -64,8 +64,12 @@ class Checkpoint:
     # By sensor: number of points, model and sight of the last scan that was new.
     _sights: dict[Any, Any] = field(default_factory=dict, init=False, compare=False)
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.config, ModelConfig):
+            object.__setattr__(self, "config", ModelConfig(self.config))
+
     def __repr__(self) -> str:
-        kind = (self.config.get("generator") or {}).get("name", "rectified_flow")
+        kind = self.config.generator["name"]
         size = "x".join(map(str, self.sensor.shape))
         sensor = f"{size} {self.sensor.name}"
         return f"Checkpoint({title_of(self.path)}, {kind}, {sensor}, step {self.step})"
@@ -314,9 +318,9 @@ def load_checkpoint(
         with naming(path), reading_errors(path):
             if path.suffix == ".safetensors":
                 notes = read_safetensors(path)
-                checkpoint = _built(
-                    notes["config"], notes["weights"], notes, path, int(notes["step"]), backbone
-                )
+                config = ModelConfig(notes["config"])
+                weights = notes["weights"]
+                checkpoint = _built(config, weights, notes, path, int(notes["step"]), backbone)
             else:
                 checkpoint = _of_torch(read_checkpoint(path), path, averaged, backbone)
     except InputError:
@@ -354,7 +358,9 @@ def _of_torch(content: Any, path: Path, averaged: bool, backbone: nn.Module | No
                 "rays": "centre",
             }
         drawing = {"sampler": converted.sampler, "fixed": converted.fixed}
-        return _built(config, converted.weights, drawing, path, converted.step, kind="published")
+        return _built(
+            ModelConfig(config), converted.weights, drawing, path, converted.step, kind="published"
+        )
     if isinstance(content, dict) and {HYPER, NOTES, "state_dict"} <= content.keys():
         state: Any = (
             content["state_dict"]
@@ -371,7 +377,8 @@ def _of_torch(content: Any, path: Path, averaged: bool, backbone: nn.Module | No
             content[HYPER], content.get("datamodule_hyper_parameters") or {}, notes["stage"]
         )
         config |= {"plugins": notes["plugins"], "trainer": {"max_steps": notes["total_steps"]}}
-        return _built(config, weights, notes, path, int(content.get("global_step", 0)), backbone)
+        step = int(content.get("global_step", 0))
+        return _built(ModelConfig(config), weights, notes, path, step, backbone)
     systems = ", ".join(known.system for known in FORMATS.values())
     found = (
         ", ".join(map(repr, list(content)[:6]))
@@ -386,7 +393,7 @@ def _of_torch(content: Any, path: Path, averaged: bool, backbone: nn.Module | No
 
 
 def _built(
-    config: dict[str, Any],
+    config: ModelConfig,
     weights: Mapping[str, Tensor],
     drawing: Mapping[str, Any],
     path: Path,
@@ -398,7 +405,7 @@ def _built(
     # First weights are drawn and replaced: neither the caller's random numbers nor torch's defaults
     # matter.
     with (
-        made_with(config, str(path)),
+        made_with(config.plugins, str(path)),
         torch.random.fork_rng(devices=[]),
         torch.device("cpu"),
         ExitStack() as stack,
@@ -406,7 +413,7 @@ def _built(
         stack.callback(torch.set_default_dtype, torch.get_default_dtype())
         torch.set_default_dtype(torch.float32)
         network = {} if backbone is None else {"backbone": BACKBONES.options(deepcopy(backbone))}
-        generator = build_generator({**config, **network})
+        generator = build_generator({**config.model, **network})
         check_weights(generator, weights)
         generator.load_state_dict(weights)
         if drawing.get("sampler"):

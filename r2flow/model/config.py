@@ -1,7 +1,8 @@
 """The config of a run: one tree of typed values, whose annotations are the rules of its keys."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -32,7 +33,14 @@ from r2flow.base.registry import (
     construct,
     strict,
 )
-from r2flow.data.options import DataOptions
+from r2flow.data.options import (
+    DataOptions,
+    PairOptions,
+    ParentRecord,
+    ReadingOptions,
+    ValidationOptions,
+)
+from r2flow.model.parts import MODEL
 
 _Named = Annotated[Options, Bound("a group with a name", lambda group: "name" in group)]
 _InRuns = Annotated[
@@ -94,18 +102,6 @@ class SampleOptions:
     """Samples drawn at the end of a run."""
 
     num: Natural = 4
-
-
-@dataclass(frozen=True)
-class ParentRecord:
-    """Identity of the model that a run starts from, as its checkpoints store it."""
-
-    path: Free[str]
-    weights: str | None  # hash of the averaged weights; None: not trained yet
-    step: int
-    stage: str
-    first_pair: int  # the first pair whose noise the model was not trained on
-    pairs: Free[str]  # default folder of its pairs
 
 
 @dataclass(frozen=True)
@@ -180,6 +176,88 @@ class RunConfig:
     def plain(self) -> Config:
         """The config as nested dictionaries, as in its file."""
         return asdict(self)
+
+    def model_config(self) -> "ModelConfig":
+        """The config that a checkpoint of the run has."""
+        return ModelConfig(self.plain())
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """How a model was trained."""
+
+    name: str | None = None  # of a stage in `STAGES`; None: unknown
+    parent: ParentRecord | None = None  # the model that it started from
+    options: Options = field(default_factory=dict)  # the stage's others
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The config that a model was trained with, as far as its file keeps it, with typed groups."""
+
+    stored: Options
+
+    @property
+    def model(self) -> Config:
+        """The groups that `build_generator` takes."""
+        return {group: self.stored.get(group) for group in MODEL}
+
+    @property
+    def backbone(self) -> str | None:
+        """Name of the backbone; None: the generator has its own network."""
+        return (self.stored.get("backbone") or {}).get("name")
+
+    @property
+    def generator(self) -> Config:
+        """Name and options of the generator."""
+        return self.stored.get("generator") or {"name": "rectified_flow"}
+
+    @cached_property
+    def stage(self) -> StageRecord:
+        """The stage that trained it."""
+        options = dict(self.stored.get("stage") or {})
+        name = options.pop("name", None)
+        parent = options.pop("parent", None)
+        if isinstance(parent, Mapping):
+            parent = construct("stage.parent", ParentRecord, parent)
+        return StageRecord(name, parent, options)
+
+    @cached_property
+    def data(self) -> DataOptions:
+        """The scans that it was trained on; the file may have keys of other versions."""
+        options = _known(DataOptions, self.stored.get("data") or {})
+        for group, kind in _GROUPS_OF_DATA.items():
+            if isinstance(options.get(group), Mapping):
+                options[group] = _known(kind, options[group])
+        return construct("data", DataOptions, options)
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+        return self.stored.get("seed") or 0
+
+    @property
+    def steps(self) -> int:
+        """Optimiser steps of the whole training; 0: unknown."""
+        return (self.stored.get("trainer") or {}).get("max_steps") or 0
+
+    @property
+    def plugins(self) -> Sequence[str]:
+        """Plug-ins that it was trained with."""
+        return self.stored.get("plugins") or ()
+
+
+_GROUPS_OF_DATA = {
+    "reading": ReadingOptions,
+    "validation": ValidationOptions,
+    "pairs": PairOptions,
+}
+
+
+def _known(kind: Any, options: Options) -> Config:
+    """The options that a dataclass has, without those that are None."""
+    names = [one.name for one in fields(kind)]
+    return {name: options[name] for name in names if options.get(name) is not None}
 
 
 def is_free(key: str) -> bool:

@@ -198,7 +198,7 @@ def notes_of(checkpoint: Checkpoint, how: Sampler, steps: Tableau | None) -> Con
         "step": checkpoint.step,
         "image": list(space.shape),
         "sensor": space.sensor.described(),
-        "encoding": checkpoint.config["encoding"],
+        "encoding": checkpoint.config.model["encoding"],
     }
     if steps is None:
         return {**notes, "outputs": {"v": "dx/dt at x and t, of flow maps its mean from t to s"}}

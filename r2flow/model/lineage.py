@@ -1,7 +1,7 @@
 """Lineage: what a stage takes from the trained model that it starts from."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,15 +9,15 @@ from torch import nn
 
 from r2flow.backbones import BACKBONES
 from r2flow.base.errors import InputError
-from r2flow.base.registry import Config, Options, construct, options_of
-from r2flow.data.options import ReadingOptions
+from r2flow.base.registry import Config, Options, options_of
+from r2flow.data.options import PAIRS, ParentRecord, ReadingOptions
 from r2flow.data.pairs import default_folder
 from r2flow.data.reading import AUTO
 from r2flow.generators import GENERATORS
 from r2flow.lidar.encoding import encoding_options
 from r2flow.lidar.sensors import sensor_options
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint
-from r2flow.model.config import ParentRecord
+from r2flow.model.config import ModelConfig
 from r2flow.model.saving import weights_hash
 from r2flow.model.shipped import name_of
 
@@ -33,7 +33,7 @@ _GROUPS: dict[str, tuple[str, Callable[[Any], Config]]] = {
 class Parent:
     """The model that a stage starts from, or only its config if it has not been trained yet."""
 
-    config: Options
+    config: ModelConfig
     path: Path
     step: int = 0
     checkpoint: Checkpoint | None = None
@@ -41,22 +41,25 @@ class Parent:
     @property
     def reading(self) -> ReadingOptions | None:
         """How the scans that the model learned from became images, if it was from scans."""
-        reading = (self.config.get("data") or {}).get("reading")
-        return construct("data.reading", ReadingOptions, reading) if reading else None
+        return self.config.data.reading
 
-    def record(self) -> Config:
-        """The `ParentRecord` of the checkpoints of its children, as plain values."""
-        data = self.config.get("data", {})
-        pairs = data.get("pairs") if data.get("name") == "pairs" else None
-        record = ParentRecord(
+    @property
+    def unfolded(self) -> bool:
+        """Whether it is published, and was trained on unfolded scans."""
+        published = self.checkpoint is not None and self.checkpoint.format == "published"
+        return published and self.reading is not None and self.reading.projection == "unfolding"
+
+    def record(self) -> ParentRecord:
+        """What the checkpoints of its children say of it."""
+        data = self.config.data
+        return ParentRecord(
             path=str(self.path),
             weights=weights_hash(self.checkpoint) if self.checkpoint else None,
             step=self.step,
-            stage=(self.config.get("stage") or {}).get("name", "rectify"),
-            first_pair=pairs["first"] + pairs["num"] if pairs else 0,
+            stage=self.config.stage.name or "rectify",
+            first_pair=(data.pairs.first or 0) + data.pairs.num if data.name == PAIRS else 0,
             pairs=str(default_folder(self.path)),
         )
-        return asdict(record)
 
 
 def find_parent(name: "str | Path | Parent", backbone: Any = None) -> Parent:
@@ -68,7 +71,7 @@ def find_parent(name: "str | Path | Parent", backbone: Any = None) -> Parent:
         return name
     network = backbone if isinstance(backbone, nn.Module) else None
     checkpoint = load_checkpoint(str(name), backbone=network)
-    total = checkpoint.config.get("trainer", {}).get("max_steps") or 0
+    total = checkpoint.config.steps
     is_run = Path(str(name)).expanduser().is_dir() and name_of(checkpoint.path) is None
     if is_run and checkpoint.step < total:
         raise InputError(
@@ -99,9 +102,8 @@ def model_options(
     Raises:
         InputError: an unknown name or option, or one that contradicts the parent.
     """
-    theirs = parent.config if parent else {}
-    reading = parent.reading if parent else None
-    if parent and "published" in theirs and reading and reading.projection == "unfolding":
+    theirs = parent.config.model if parent else {}
+    if parent and parent.unfolded:
         raise InputError(
             f"{parent.path} was trained on unfolded scans, whose rings a new run's sensor does not "
             "have; "
@@ -145,7 +147,7 @@ def _refuse_other(group: str, options: Options, parent: Parent, free: set[str]) 
     to the default.
     """
     ours = options[group] or {}
-    theirs = parent.config[group] or {}
+    theirs = parent.config.model[group] or {}
     for key in ours.keys() & theirs.keys() - free:
         if plain(ours[key]) != plain(theirs[key]):
             raise InputError(

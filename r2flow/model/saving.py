@@ -24,7 +24,7 @@ def weights_hash(checkpoint: "Checkpoint") -> str:
     """Hash of a generator in 16 hex digits: averaged weights, sensor and encoding, independent of
     the file format.
     """
-    meaning = {key: checkpoint.config[key] for key in ("sensor", "encoding")}
+    meaning = {key: checkpoint.config.model[key] for key in ("sensor", "encoding")}
     state = {
         name.removeprefix(BACKBONE): value
         for name, value in checkpoint.generator.state_dict().items()
@@ -42,7 +42,7 @@ def save_checkpoint(checkpoint: "Checkpoint", path: str | Path, half: bool = Fal
     path = Path(path)
     check(path.suffix == ".safetensors", f"{path}: a checkpoint is written as .safetensors.")
     check(
-        checkpoint.sensor == build_space(checkpoint.config).sensor,
+        checkpoint.sensor == build_space(checkpoint.config.model).sensor,
         f"{path}: a file keeps the sensor of training alone: save the model before `through`.",
     )
     weights = {
@@ -57,8 +57,8 @@ def save_checkpoint(checkpoint: "Checkpoint", path: str | Path, half: bool = Fal
                 weights[name].isfinite().all(),
                 f"{path}: weights beyond 65504 do not fit into float16: save them without half.",
             )
-    config = learned(checkpoint.config)
-    if plugins := checkpoint.config.get("plugins"):
+    config = learned(checkpoint.config.stored)
+    if plugins := checkpoint.config.plugins:
         config["plugins"] = [Path(name).name for name in plugins]
     notes = {"config": config, "step": checkpoint.step, **checkpoint.generator.drawing()}
     notes["digest"] = state_hash(weights, notes)

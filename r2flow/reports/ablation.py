@@ -94,7 +94,7 @@ def measure_run(run: str, judge: Judge, evaluations: Sequence[int] | None) -> li
     generator = checkpoint.generator
     if not generator.unconditional:
         return []
-    costs = cost(checkpoint.config, 5, judge.device)
+    costs = cost(checkpoint.config.model, 5, judge.device)
     figures: Row = {
         "parameters, millions": costs["parameters"] / 1e6,
         "GMAC": costs["gmac"],

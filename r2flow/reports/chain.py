@@ -16,6 +16,7 @@ from r2flow.evaluation.sets import baseline_sets
 from r2flow.generators import Generator, Sampler
 from r2flow.metrics.panel import distances, mean_distance, panel
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint
+from r2flow.model.config import ModelConfig
 from r2flow.model.sampling import sample
 from r2flow.model.shipped import DEFAULT, find_model
 from r2flow.reports.compare import compare_page
@@ -65,19 +66,20 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
     drawn = list(_drawn(makers, device))
     rows = [row for row, _ in drawn]
     captions = [row["title"] for row in rows]
-    labels = [link_label(one, model.config["stage"]["name"]) for one, model in makers.items()]
+    labels = [link_label(one, model.config.stage.name or "") for one, model in makers.items()]
     if rows[-1]["scans"] == DEFAULT:
         labels.append(f"{DEFAULT} (a larger model, included)")
     about = f"{', '.join(labels)}. An evaluation runs the network once."
     said = []
-    then = what_next(runs[name], out, last.config | {"data": first.config.get("data", {})})
+    trained = ModelConfig({**last.config.stored, "data": first.config.stored.get("data")})
+    then = what_next(runs[name], out, trained)
     if sets := _scan_sets(first):
         unseen, training = sets
         drawn.insert(0, ({"scans": _GOAL}, training[:].numpy()))
         rows = _with_distances(drawn, unseen, training)
         ends = [f"{row['title']}: distance {row['distance']}" for row in rows[1:-1]]
         captions = ["a training scan", *ends]
-        said = _conclusion(rows, first.step * first.config["data"]["batch_size"])
+        said = _conclusion(rows, first.step * first.config.data.batch_size)
         nearest = min(rows[1:], key=lambda row: row["distance"])
         if nearest["scans"] == DEFAULT:
             longer = f"chain.{next(iter(runs))}.trainer.max_steps={10 * first.step}"
@@ -142,8 +144,9 @@ def _draw(model: Checkpoint, label: str, sampler: Sampler) -> tuple[Row, ndarray
 
 def _scan_sets(first: Checkpoint) -> tuple[ScanSet, ScanSet] | None:
     """Held-out scans and some training scans of the first run; None for a run on pairs."""
-    groups = {key: first.config[key] for key in ("sensor", "encoding", "seed")}
-    data = ScanDataModule(**first.config["data"], **groups)
+    config = first.config
+    groups = {key: config.model[key] for key in ("sensor", "encoding")}
+    data = ScanDataModule(**vars(config.data), **groups, seed=config.seed)
     data.setup()
     training, held_out = data.training_source, data.validation_source
     if not (

@@ -9,7 +9,8 @@ from pathlib import Path
 from statistics import fmean, stdev
 
 from r2flow.base.config import flatten
-from r2flow.model.config import learned
+from r2flow.data.options import PAIRS
+from r2flow.model.config import ModelConfig, learned
 from r2flow.reports.pages import Page
 from r2flow.reports.runs import ComparedRun, read_runs
 from r2flow.reports.tables import Part, Row, Table
@@ -69,23 +70,22 @@ def group_runs(runs: Sequence[ComparedRun]) -> Groups:
     return named
 
 
-def configuration(config: Row) -> str:
+def configuration(config: ModelConfig) -> str:
     """Settings of a run and its ancestors that affect the result, without seeds, as text."""
     ignored = ["seed"]
-    if config["data"]["name"] == "pairs":  # their parent differs between seeds
+    if config.data.name == PAIRS:  # their parent differs between seeds
         ignored += ["data.pairs.parent", "scans"]
     settings = {
         key: value
-        for key, value in flatten(learned(config))
+        for key, value in flatten(learned(config.stored))
         if key not in ignored and not key.startswith("stage.parent.")
     }
-    values = dict(flatten(config))  # a run may resume with other values of these
+    values = dict(flatten(config.stored))  # a run may resume with other values of these
     for key in ("trainer.precision", "stage.parent.step", "data.pairs.of"):
         settings[key] = values.get(key)
-    parent = config["stage"].get("parent")
-    if parent:
-        before = read_config(Path(parent["path"]).parent.parent)
-        settings["parent"] = configuration(before) if before else parent["weights"]
+    if parent := config.stage.parent:
+        before = read_config(Path(parent.path).parent.parent)
+        settings["parent"] = configuration(ModelConfig(before)) if before else parent.weights
     return json.dumps(settings, sort_keys=True, default=str)
 
 
@@ -142,7 +142,7 @@ def compare_page(groups: Groups) -> Page:
     figures = {}
     if any(run.curves for _, run in members):
         figures["compare"] = curves_figure([(label, run.curves) for label, run in members])
-    seeds = {run.label: int(run.config["seed"]) for _, run in members if "seed" in run.config}
+    seeds = {run.label: run.config.seed for _, run in members}
     each = [{"group": label, "run": run.label, **run.values} for label, run in members]
     title = "Runs compared"
     return Page("compare", title, text, rows, figures, seeds, more={"runs": each}, details=[_NOTES])

@@ -14,7 +14,7 @@ def describe(path: str | Path) -> dict[str, Any]:
     """Generator, parameters, sensor, encoding, step and config of a checkpoint."""
     loaded = load_checkpoint(path)
     model = name_of(loaded.path)
-    config = {key: value for key, value in loaded.config.items() if key != "published"}
+    config = loaded.config
     generator = loaded.generator
     about = {}
     if model:
@@ -26,15 +26,15 @@ def describe(path: str | Path) -> dict[str, Any]:
         "bytes": loaded.path.stat().st_size,
         "format": loaded.format,
         "step": loaded.step,
-        "stage": config.get("stage", {}).get("name", "unknown"),
-        "generator": (config.get("generator") or {}).get("name", "rectified_flow"),
-        "backbone": (config["backbone"] or {}).get("name"),
+        "stage": config.stage.name or "unknown",
+        "generator": config.generator["name"],
+        "backbone": config.backbone,
         "parameters": sum(parameter.numel() for parameter in generator.parameters()),
         "sensor": loaded.sensor.name,
         "image": list(loaded.encoding.shape),
         "range_m": [loaded.sensor.min_range, loaded.sensor.max_range],
         **about,
-        "config": config,
+        "config": {key: config.stored[key] for key in config.stored if key != "published"},
     }
 
 

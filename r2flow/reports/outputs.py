@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from r2flow.base.config import as_override
 from r2flow.base.errors import InputError
 from r2flow.base.progress import Bar, track
 from r2flow.data.detection import reading_for
+from r2flow.data.options import SIMULATED
 from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.lidar.labels import SEMANTIC_KITTI, LabelList, label_list, write_labels
@@ -22,6 +23,7 @@ from r2flow.lidar.projection import image_points, write_scan
 from r2flow.lidar.region import Region
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import label
+from r2flow.model.config import ModelConfig
 from r2flow.model.paths import title_of
 from r2flow.model.sampling import draw, warn_unsolved
 from r2flow.model.saving import weights_hash
@@ -153,7 +155,7 @@ def recipe_of(
     return {
         "reading": reading_for([], checkpoint, label_ids=label_ids).described(),
         "encoding": {
-            **checkpoint.config.get("encoding", {}),
+            **(checkpoint.config.model["encoding"] or {}),
             "reflectance": checkpoint.encoding.reflectance,
             "min_range": checkpoint.sensor.min_range,
             "max_range": checkpoint.sensor.max_range,
@@ -177,18 +179,18 @@ def _draw_samples(images: Sequence[ndarray], rays: Tensor, out: Path, title: str
     write_viewer(out / "samples.html", panels, title)
 
 
-def what_next(run: Path, out: Path, config: Mapping[str, Any]) -> str:
+def what_next(run: Path, out: Path, config: ModelConfig) -> str:
     """Suggested commands after sampling a run to `out`: training on real scans, the next link, or
     evaluation.
     """
-    plugins = "".join(f" --plugin {shlex.quote(name)}" for name in config.get("plugins") or ())
+    plugins = "".join(f" --plugin {shlex.quote(name)}" for name in config.plugins)
     quoted = shlex.quote(str(run))
-    stage = config["stage"]
-    if config["data"]["name"] == "simulated":
+    stage = config.stage
+    if config.data.name == SIMULATED:
         then = "train data=kitti_raw data.root=FOLDER backbone=hdit_small"
-    elif stage["name"] == "rectify" and not stage.get("parent"):
+    elif stage.name == "rectify" and not stage.parent:
         then = f"train experiment=reflow {as_override('stage.parent', run)}{plugins}"
-    elif stage["name"] == "reflow":
+    elif stage.name == "reflow":
         then = f"train experiment=distill {as_override('stage.parent', run)}{plugins}"
     else:
         then = f"evaluate REAL {quoted}{plugins}"

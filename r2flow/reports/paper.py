@@ -78,18 +78,17 @@ def role_of(checkpoint: Checkpoint, label: str) -> str:
     """The row of table I for a checkpoint, from its config; `label` if the config does not
     determine it.
     """
-    config = checkpoint.config
-    generator = config.get("generator") or {}
-    stage = config.get("stage") or {}
-    system = _SYSTEMS.get(generator.get("name", ""))
+    generator = checkpoint.config.generator
+    stage = checkpoint.config.stage
+    system = _SYSTEMS.get(generator["name"])
     if system:
         if (generator.get("unet") or {}).get("position") == "learnable":
             system = f"{system} + APE"
         return system if checkpoint.encoding.reflectance else f"{system}, range"
-    role, learned_from = _ROLES.get(stage.get("name", ""), (label, None))
-    if (stage.get("parent") or {}).get("stage") not in (None, learned_from):
+    role, learned_from = _ROLES.get(stage.name or "", (label, None))
+    if stage.parent and stage.parent.stage not in (None, learned_from):
         return label
-    return role.format(stage.get("steps"))
+    return role.format(stage.options.get("steps"))
 
 
 def report_paper(
@@ -235,9 +234,9 @@ def _architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], device: st
         if run.role != "1-RF":
             continue
         config = run.checkpoint.config
-        measured = cost(config, 3, device)
+        measured = cost(config.model, 3, device)
         printed = _same_architecture(measured["parameters"])
-        line = {**printed, **measured, "backbone": (config["backbone"] or {}).get("name")}
+        line = {**printed, **measured, "backbone": config.backbone}
         weights = weights_hash(run.checkpoint)
         evaluated = [row for row in rows if row["weights"] == weights and "frd/frd" in row]
         best = max(evaluated, key=lambda row: row["evaluations"], default=None)

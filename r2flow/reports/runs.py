@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 from r2flow.base.errors import InputError, check, naming
 from r2flow.base.plugins import made_with
+from r2flow.data.options import PAIRS
+from r2flow.model.config import ModelConfig
 from r2flow.model.paths import checkpoints_of, step_of
 from r2flow.reports.backbones import cost
 from r2flow.reports.tables import Row, short_names
@@ -20,7 +22,7 @@ class ComparedRun(NamedTuple):
     """A run, read from its folder."""
 
     label: str
-    config: Row
+    config: ModelConfig
     values: Row  # by column; None where the folder does not hold one
     curves: dict[str, Curve]  # (steps, values) by logged name
 
@@ -51,38 +53,37 @@ def read_runs(paths: Sequence[Path]) -> list[ComparedRun]:
     costs = {}
     runs = []
     for path, label in zip(folders, short_names(folders), strict=True):
-        config = read_config(path) or {}
-        whole = {"stage", "backbone", "data", "sensor", "encoding"} <= config.keys()
-        whole = whole and "batch_size" in config["data"]
-        check(whole, f"{path / CONFIG} is not the config of a run.")
-        keys = ("sensor", "encoding", "backbone", "generator")
-        architecture = json.dumps([config.get(key) for key in keys], sort_keys=True)
-        if architecture not in costs:
-            with naming(path), made_with(config, str(path)):
-                costs[architecture] = cost(config)
+        stored = read_config(path) or {}
+        whole = {"stage", "backbone", "data", "sensor", "encoding"} <= stored.keys()
+        check(whole and stored["data"], f"{path / CONFIG} is not the config of a run.")
+        config = ModelConfig(stored)
+        architecture = json.dumps(config.model, sort_keys=True)
+        with naming(path), made_with(config.plugins, str(path)):
+            if architecture not in costs:
+                costs[architecture] = cost(config.model)
         curves = read_curves(path, tuple(CURVES))
         values = costs[architecture] | _read_values(path, config, curves)
         runs.append(ComparedRun(label, config, values, curves))
     return runs
 
 
-def _read_values(path: Path, config: Row, curves: Mapping[str, Curve]) -> Row:
+def _read_values(path: Path, config: ModelConfig, curves: Mapping[str, Curve]) -> Row:
     """Columns of a run that do not depend on its network."""
     train, validation, bend = (
         curves[name][1].tolist() if name in curves else [] for name in CURVES
     )
     kept = [step_of(checkpoint) for checkpoint in checkpoints_of(path)[:1]]
     step = max(kept or [int(steps[-1]) for steps, _ in curves.values()], default=None)
-    stage = config["stage"]
-    data = config["data"]
-    scans = "" if data["name"] == "pairs" else data.get("root") or ""
+    stage = config.stage
+    data = config.data
+    scans = "" if data.name == PAIRS else data.root or ""
     return {
-        "stage": f"{stage['name']} {stage.get('steps', '')}".strip(),
-        "loss": str([stage.get(key) for key in ("loss", "time")]),
-        "data": f"{data['name']} {scans}".strip(),
-        "backbone": (config["backbone"] or {}).get("name"),
+        "stage": f"{stage.name} {stage.options.get('steps', '')}".strip(),
+        "loss": str([stage.options.get(key) for key in ("loss", "time")]),
+        "data": f"{data.name} {scans}".strip(),
+        "backbone": config.backbone,
         "steps": step,
-        "images": step and step * int(data["batch_size"]),
+        "images": step and step * data.batch_size,
         "train_loss": fmean(train[-max(len(train) // 10, 1) :]) if train else None,
         "val_best": min(validation, key=lambda loss: (math.isnan(loss), loss), default=None),
         "val_last": validation[-1] if validation else None,

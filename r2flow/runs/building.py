@@ -23,7 +23,7 @@ from r2flow.callbacks.loggers import LOGGERS, LearningRates
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.options import MIXED, PAIRS, SIMULATED, DataOptions, ReadingOptions
 from r2flow.data.resolving import check_intensities
-from r2flow.model.config import RunConfig
+from r2flow.model.config import ModelConfig, RunConfig
 from r2flow.model.lineage import Parent, find_parent, model_options
 from r2flow.model.parts import MODEL, config_of
 from r2flow.runs.folder import check_run, read_config
@@ -76,14 +76,15 @@ def build(
     run = config if isinstance(config, RunConfig) else RunConfig.of(config)
     if run.chain or run.preview:
         raise InputError("this config is a chain of runs: train it by `r2flow train`.")
-    with quiet(), made_with(read_config(run.run_dir) or {}, f"the run in {run.run_dir}"):
+    before = ModelConfig(read_config(run.run_dir) or {})
+    with quiet(), made_with(before.plugins, f"the run in {run.run_dir}"):
         keys = [key_of(text) for text in asked]
         stage_options = dict(run.stage)
         stage_class = STAGES[stage_options.pop("name")]
         named = stage_options.pop("parent", None)
         if parent is None and named is not None:
             parent = find_parent(named["path"] if isinstance(named, Mapping) else named)
-        with made_with(parent.config if parent else {}, "the run that it starts from"):
+        with made_with(parent.config.plugins if parent else (), "the run that it starts from"):
             options = model_options(
                 _given(run, keys, parent),
                 parent,
@@ -166,7 +167,7 @@ def _build_data(
         module.encoding.levels = options["encoding"].get("levels")
     if parent and drawer and module.pairs:
         for group in ("sensor", "encoding"):
-            if drawer.config[group] != parent.config[group]:
+            if drawer.config.model[group] != parent.config.model[group]:
                 raise InputError(
                     f"data.pairs.of={module.pairs.of} has another {group} than {parent.path}."
                 )

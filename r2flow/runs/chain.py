@@ -141,7 +141,7 @@ def check_links(links: Sequence[Link]) -> None:
             before = configs[link.parent]
             steps = before.trainer.max_steps
             file = Path(before.run_dir, FOLDER, f"step-{steps:08d}.ckpt")
-            parent = Parent(before.plain(), file, steps)
+            parent = Parent(before.model_config(), file, steps)
         try:
             configs[link.name] = check(link.config, link.asked, parent)
         except InputError as error:

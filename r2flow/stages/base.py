@@ -5,6 +5,7 @@ import logging
 import math
 from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, TypedDict
@@ -21,9 +22,18 @@ from r2flow.base.errors import InputError, naming
 from r2flow.base.noise import seed_torch
 from r2flow.base.plugins import loaded_plugins
 from r2flow.base.processes import average_gradients
-from r2flow.base.registry import Config, Natural, NonNegative, Options, Portion, Seed
+from r2flow.base.registry import (
+    Config,
+    Natural,
+    NonNegative,
+    Options,
+    Portion,
+    Seed,
+    construct,
+)
 from r2flow.data.datamodule import ScanDataModule
 from r2flow.data.loader import ItemFormat
+from r2flow.data.options import ParentRecord
 from r2flow.flow.times import golden_sequence
 from r2flow.generators import Generator, build_generator
 from r2flow.lidar.encoding import Encoding, ModelSpace
@@ -108,6 +118,7 @@ class Stage(L.LightningModule, NamedArguments):
 
     Attributes:
         generator: The generator in training.
+        parent: The model that it starts from, or None.
         own_network: Whether its network is a module of one's own, which no checkpoint can make.
         gradient_clip_val: Gradient clipping of a stage with manual optimisation, which Lightning
             leaves to it.
@@ -190,7 +201,10 @@ class Stage(L.LightningModule, NamedArguments):
             self.generator.few = build_sampler(few)
             self.generator.few.check(self.generator)
         self.generator.sampler = own
-        record = source.record() if source else parent
+        self.parent: ParentRecord | None = source.record() if source else None
+        if isinstance(parent, Mapping):
+            self.parent = construct("parent", ParentRecord, parent)
+        record = asdict(self.parent) if self.parent else None
         # kept, since a subclass may save its own arguments over them
         self._built_with = plain({**options, "parent": record, "sampler": own.asdict()})
         self.save_hyperparameters({**plain(dict(self.hparams)), **self._built_with})
@@ -200,6 +214,11 @@ class Stage(L.LightningModule, NamedArguments):
         """Set the sampler that this stage trains the generator for; it may be replaced by the
         options `sampler`.
         """
+
+    @property
+    def seed(self) -> int:
+        """Seed of draws in training."""
+        return self.hparams["seed"]
 
     @property
     def space(self) -> ModelSpace:
@@ -338,9 +357,7 @@ class Stage(L.LightningModule, NamedArguments):
         # same numbers.
         parts = self.trainer.accumulate_grad_batches
         position = self.global_step * parts + batch_idx % parts
-        seed_torch(
-            self.hparams["seed"], "dropout", position * self.trainer.world_size + self.global_rank
-        )
+        seed_torch(self.seed, "dropout", position * self.trainer.world_size + self.global_rank)
 
     def sample(self, num: int = 1, seed: int = 0, **how: Any) -> Tensor:
         """Scans 0 to num - 1 of a seed by the present weights, (num, 2 or 1, H, W): range in metres
@@ -360,7 +377,7 @@ class Stage(L.LightningModule, NamedArguments):
         return.
         """
         numbers = self.whole_batch(batch)["k"].tolist()
-        return draw(self.generator, numbers, self.hparams["seed"]).images
+        return draw(self.generator, numbers, self.seed).images
 
     def log_mean(self, name: str, value: Tensor, batch: Batch, **options: Any) -> None:
         """Log a mean over the scans of a batch, whose mean over all devices has equal weights."""

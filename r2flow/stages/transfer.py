@@ -191,7 +191,7 @@ class Transfer(SingleLoss):
         state = torch.where(images[:, 0] > 0, int(Ray.RETURN), int(Ray.EMPTY))
         state[:, torch.arange(images.shape[2]) % 4 != 0] = int(Ray.UNKNOWN)
         images = images * (state != Ray.UNKNOWN)[:, None]
-        answers = complete(self.generator, images, state, seed=self.hparams["seed"])
+        answers = complete(self.generator, images, state, seed=self.seed)
         return torch.cat([answer.images for answer in answers])
 
     def regression_loss(self, batch: Batch, u: Tensor) -> Tensor:

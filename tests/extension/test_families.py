@@ -129,7 +129,7 @@ def test_a_flow_is_straightened(tmp_path: Path, tmp_path_factory: pytest.TempPat
     assert r2flow("train", "experiment=reflow", *options).said
     with loaded(BACKBONE):
         first, second = load_checkpoint(run), load_checkpoint(tmp_path / "two")
-    assert second.config["stage"]["name"] == "reflow"
+    assert second.config.stage.name == "reflow"
     assert type(second.generator).__name__ == type(first.generator).__name__
     assert second.generator.state_dict().keys() == first.generator.state_dict().keys()
 

@@ -14,6 +14,7 @@ from PIL import Image
 
 from r2flow.base.errors import InputError
 from r2flow.generators import build_generator
+from r2flow.model.config import ModelConfig
 from r2flow.reports.compare import _group_rows, cell, compare_page, configuration, group_runs
 from r2flow.reports.pages import write_page
 from r2flow.reports.runs import _find_runs, read_runs
@@ -144,7 +145,7 @@ def test_two_sweeps_are_told_apart_by_what_was_swept(tmp_path):
         )
     groups = group_runs(read_runs([tmp_path]))
     assert {
-        label: [run.config["stage"]["loss"] for run in runs] for label, runs in groups.items()
+        label: [run.config.stage.options["loss"] for run in runs] for label, runs in groups.items()
     } == {f"stage.loss={loss}": [loss, loss] for loss in ("absolute", "mse")}
 
 
@@ -162,9 +163,9 @@ def test_children_of_several_seeds_are_one_configuration_and_of_other_parents_an
     same = child(make_run(tmp_path / "b", {"seed": 1}), "bbb", seed=1)
     other = child(make_run(tmp_path / "c", {"stage.learning_rate": 2e-3}), "ccc", seed=2)
     gone = child(tmp_path / "nowhere", "ddd", seed=3)
-    assert configuration(first) == configuration(same)
+    assert configuration(ModelConfig(first)) == configuration(ModelConfig(same))
     others = (other, gone, CONFIG, {**CONFIG, "scans": "8 of 8 scans, another data set"})
-    assert len({configuration(one) for one in (first, *others)}) == 5
+    assert len({configuration(ModelConfig(one)) for one in (first, *others)}) == 5
 
 
 @pytest.mark.parametrize("key", ["trainer.precision", "parent.step", "data.pairs.of"])

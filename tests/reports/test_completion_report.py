@@ -69,7 +69,7 @@ def test_a_model_that_knows_the_truth_has_no_error_and_one_that_is_off_has_that(
 
 
 def test_interpolations_are_judged_as_any_answer(checkpoint, truths):
-    config = {**checkpoint.config, "encoding": {**CONFIG["encoding"], "reflectance": False}}
+    config = {**checkpoint.config.stored, "encoding": {**CONFIG["encoding"], "reflectance": False}}
     ways = {
         "range": (Checkpoint(build_generator(config).eval(), config), checkpoint.generator.sampler)
     }

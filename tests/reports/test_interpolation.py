@@ -75,6 +75,6 @@ def test_reflectance_is_scaled_by_who_wrote_the_file(tmp_path, of_sensor, traine
     write_points(raw, xyz, 255 * reflectance)
     sensor = replace(SENSOR, reflectance_scale=of_sensor)
     checkpoint.generator.space = ModelSpace(sensor, Encoding(sensor), sensor.rays())
-    checkpoint.config["data"] = {"name": "folder", "reading": {"reflectance_scale": trained}}
+    checkpoint.config.stored["data"] = {"name": "folder", "reading": {"reflectance_scale": trained}}
     found = real_scans(checkpoint, [raw, own])[1]
     torch.testing.assert_close(found, image.expand_as(found), atol=1e-3, rtol=1e-4)

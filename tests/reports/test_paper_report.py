@@ -2,11 +2,13 @@
 
 import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.config import ModelConfig
 from r2flow.model.saving import weights_hash
 from r2flow.reports.paper import (
     COLUMNS,
@@ -44,8 +46,9 @@ def test_every_run_finds_its_role(runs):
     }
     checkpoint = load_checkpoint(runs["2-RF"])
     for parent, role in (("rectify", "2-RF"), ("reflow", "label")):  # reflow of a 2-RF is a 3-RF
-        checkpoint.config["stage"]["parent"] = {"stage": parent}
-        assert role_of(checkpoint, "label") == role
+        stage = {"name": "reflow", "parent": {"stage": parent}}
+        config = ModelConfig({**checkpoint.config.stored, "stage": stage})
+        assert role_of(replace(checkpoint, config=config), "label") == role
 
 
 def test_an_architecture_of_the_paper_is_known_by_its_size():

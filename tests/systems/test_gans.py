@@ -333,7 +333,7 @@ def test_a_published_file_is_a_generator(shared: Path, name: str, averaged: bool
     checkpoint = load_checkpoint(
         shared / "oracle_baselines" / f"{name}_published.pth", averaged=averaged
     )
-    assert checkpoint.config["published"] == io["cfg"]
+    assert checkpoint.config.stored["published"] == io["cfg"]
     assert checkpoint.step == 1_000_000 // 32
     assert (
         sum(p.numel() for p in checkpoint.generator.network.parameters())

@@ -24,6 +24,7 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.projection import project, unproject
 from r2flow.lidar.sensors import build_sensor
 from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.config import ModelConfig
 from r2flow.model.lineage import Parent
 from r2flow.runs.composing import CONF
 from r2flow.samplers import build_sampler
@@ -345,8 +346,8 @@ def test_a_published_diffusion_without_its_config_has_its_own_schedule(
         in caplog.text
     )
     assert loaded.generator.space.shape == (1, 64, 1024)
-    assert loaded.config["generator"]["unet"]["head_channels"] == 32
-    assert loaded.config["generator"]["schedule"]["last"] == 0.0195
+    assert loaded.config.generator["unet"]["head_channels"] == 32
+    assert loaded.config.generator["schedule"]["last"] == 0.0195
 
 
 @pytest.mark.parametrize("name", ["use_new_attention_order", "scale_by_std"])
@@ -390,7 +391,7 @@ def test_callback_states_keyed_by_their_class_are_read(
         torch.save(
             {**content, "callbacks": {key: {"best_model_path": "a"}}}, tmp_path / "model.ckpt"
         )
-    assert load_checkpoint(tmp_path / "model.ckpt").config["generator"]["name"] == "vq_autoencoder"
+    assert load_checkpoint(tmp_path / "model.ckpt").config.generator["name"] == "vq_autoencoder"
 
 
 @pytest.mark.parametrize(
@@ -582,7 +583,8 @@ def test_the_published_recipe_with_positions_starts_from_its_autoencoder(tmp_pat
         check(compose(["experiment=lidm", "stage.parent=null", *common]))
     first = ["experiment=lidm_autoencoder", *common]
     config = check(
-        compose(["experiment=lidm_ape", *common]), parent=Parent(compose(first), tmp_path)
+        compose(["experiment=lidm_ape", *common]),
+        parent=Parent(ModelConfig(compose(first)), tmp_path),
     )
     # the paper's
     data = config.data

@@ -118,20 +118,20 @@ def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
     ):
         assert words in said
     first, second, third = (load_checkpoint(run / link) for link in LINKS)
-    assert [flow.config["stage"]["name"] for flow in (first, second, third)] == [
+    assert [flow.config.stage.name for flow in (first, second, third)] == [
         "rectify",
         "reflow",
         "distill",
     ]
-    assert second.config["stage"]["parent"]["weights"] == weights_hash(first)
-    assert third.config["stage"]["parent"]["weights"] == weights_hash(second)
-    assert second.config["backbone"] == first.config["backbone"]
+    assert second.config.stage.parent.weights == weights_hash(first)
+    assert third.config.stage.parent.weights == weights_hash(second)
+    assert second.config.model["backbone"] == first.config.model["backbone"]
     assert [(f.generator.sampler.steps, f.generator.fixed) for f in (first, third)] == [
         (2, False),
         (2, True),
     ]
     # The noise that 2-TD learns from is none of that which 2-RF has learned from.
-    assert (second.config["data"]["pairs"]["first"], third.config["data"]["pairs"]["first"]) == (
+    assert (second.config.data.pairs.first, third.config.data.pairs.first) == (
         0,
         8,
     )
@@ -139,8 +139,8 @@ def test_the_chain_ends_with_every_flow_and_a_report(chained: tuple[Path, str]):
 
 def test_the_report_s_distance_of_the_held_out_scans_themselves_is_0(chained: tuple[Path, str]):
     first, second = (load_checkpoint(chained[0] / link) for link in LINKS[:2])
-    groups = {key: first.config[key] for key in ("sensor", "encoding", "seed")}
-    data = ScanDataModule(**first.config["data"], **groups)
+    groups = {key: first.config.stored[key] for key in ("sensor", "encoding", "seed")}
+    data = ScanDataModule(**vars(first.config.data), **groups)
     data.read()
     held_out = data.validation_source.batch(range(len(data.validation_source))).numpy()
     unseen, training = _scan_sets(first)

@@ -78,7 +78,7 @@ def test_a_stage_that_takes_its_own_steps_clips_for_itself():
 
 def test_a_plugin_is_not_imported_because_a_file_names_it(tmp_path: Path):
     theirs = FAMILIES / "toy_gan.py"
-    made = made_with({"plugins": [str(theirs)]}, "it")
+    made = made_with([str(theirs)], "it")
     with (
         pytest.raises(InputError, match=f"no stage named 'toy_gan'; .* give --plugin {theirs}"),
         made,

@@ -22,6 +22,7 @@ from r2flow.base.signals import LATER
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import Sensor, write_sensor
 from r2flow.model.checkpoint import load_checkpoint
+from r2flow.model.config import ModelConfig
 from r2flow.model.paths import checkpoints_of, step_of
 from r2flow.model.tensor_files import read_checkpoint
 from r2flow.reports.outputs import what_next
@@ -63,8 +64,8 @@ def test_a_run_leaves_everything_in_its_folder_and_says_where(alone: tuple[Path,
     loaded = load_checkpoint(run)
     assert loaded.step == 12
     written = yaml.safe_load((run / "config.yaml").read_text())
-    assert loaded.config == {
-        **{key: written[key] for key in loaded.config},
+    assert loaded.config.stored == {
+        **{key: written[key] for key in loaded.config.stored},
         "trainer": {"max_steps": 12},
     }
 
@@ -78,12 +79,12 @@ def test_next_is_what_has_not_been_done(alone: tuple[Path, str]):
         ("reflow", "b", "pairs", "experiment=distill stage.parent=a"),
         ("distill", "b", "pairs", "r2flow evaluate REAL a"),
     ):
-        config = {"stage": {"name": stage, "parent": parent}, "data": {"name": data}}
+        config = ModelConfig({"stage": {"name": stage, "parent": parent}, "data": {"name": data}})
         assert words in what_next(Path("a"), Path("a/samples"), config=config).splitlines()[-1]
     spaced = what_next(Path("a b"), Path("a b/samples"), config=config).split("r2flow ")[1:]
     assert [shlex.split(line)[1] for line in spaced] == ["a b", "a b/samples/000000.ply", "REAL"]
     plugged = {"stage": {"name": "rectify"}, "data": {"name": "folder"}, "plugins": ["mine.py"]}
-    assert what_next(Path("a"), Path("a/samples"), config=plugged).endswith(
+    assert what_next(Path("a"), Path("a/samples"), config=ModelConfig(plugged)).endswith(
         "stage.parent=a --plugin mine.py"
     )
 

@@ -180,7 +180,7 @@ class LearnGan(Stage):
         real = batch["x_1"]
 
         def drawn(part: int) -> BatchDraws:
-            return BatchDraws(self.hparams["seed"], batch, part)
+            return BatchDraws(self.seed, batch, part)
 
         draws = drawn(_GENERATOR)
         self.discriminator.requires_grad_(False)

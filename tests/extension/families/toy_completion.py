@@ -40,7 +40,7 @@ class LearnCompletion(Rectify):
     generator_name = "toy_completion"
 
     def condition(self, batch):
-        draws = [noise.generator(self.hparams.seed, "condition", int(k)) for k in batch["k"]]
+        draws = [noise.generator(self.seed, "condition", int(k)) for k in batch["k"]]
         rows = [
             torch.from_numpy(draw.random(batch["x_1"].shape[-2]) < draw.random()) for draw in draws
         ]
