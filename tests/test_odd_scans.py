@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 
 from r2flow.base.errors import _warned
+from r2flow.data.datamodule import ScanDataModule
 from r2flow.lidar.estimation import hangs
 from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.scan_files import Points, write_points
 from r2flow.lidar.sensors import SENSORS
 from r2flow.simulator import simulate
+from tests.conftest import refused
 
 
 def street(sensor: str = "vlp16", number: int = 0) -> np.ndarray:
@@ -65,7 +67,11 @@ def test_scans_of_two_sensors_in_one_command_are_refused(r2flow, tmp_path):
     for scans in (both, [tmp_path]):
         for verb in (("complete", *scans, "--out", tmp_path / "o"), ("sensor", *scans)):
             assert "are of two sensors" in r2flow(*verb).refusal
-    assert not (tmp_path / "o").exists()
+    for verb in ("prepare", "show"):
+        assert "are of two sensors" in r2flow(verb, tmp_path, "--out", tmp_path / "o").refusal
+    assert not [*tmp_path.glob("o/*")]
+    with refused("are of two sensors"):
+        ScanDataModule("folder", "vlp16", root=str(tmp_path)).setup()
 
 
 def test_sensor_says_of_a_doubtful_reflectance_what_show_says(r2flow, tmp_path):
