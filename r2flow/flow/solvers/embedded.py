@@ -37,7 +37,8 @@ class EmbeddedMethod:
         """Solve every scene of x, (B, ...), from the first time to the last with its own steps."""
         from r2flow.flow.solvers.adaptive import advance
 
-        return v.solution(advance(v, x, *times.tolist(), self))
+        t_0, t_1 = times.tolist()
+        return v.solution(advance(v, x, t_0, t_1, self))
 
     @property
     def distinct(self) -> dict[float, int]:

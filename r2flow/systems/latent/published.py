@@ -203,7 +203,7 @@ def _config(generator: Config, path: Path, notes: Options) -> Config:
     }
     scale = farthest
     if images["log_scale"]:
-        scale = ShiftedLog(build_sensor(**sensor)).scale  # type: ignore[arg-type]
+        scale = ShiftedLog(build_sensor(**sensor)).scale
     form = {"fov": [3, -25], "depth_scale": scale}
     _refuse_other(path, form, {**form, **found})
     return {
