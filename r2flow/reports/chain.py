@@ -1,12 +1,10 @@
 """Report at the end of a chain: how near its flows' scans are to held-out ones, and pictures."""
 
-from bisect import bisect
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
+import torch
 from numpy import ndarray
 
 from r2flow.data.datamodule import ScanDataModule
@@ -19,12 +17,11 @@ from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.model.config import ModelConfig
 from r2flow.model.sampling import sample
 from r2flow.model.shipped import DEFAULT, find_model
-from r2flow.reports.compare import compare_page
+from r2flow.reports.compare import report_runs
 from r2flow.reports.outputs import what_next, write_samples
-from r2flow.reports.pages import write_page
+from r2flow.reports.pages import print_text, write_page
 from r2flow.reports.pictures import contact_sheet
-from r2flow.reports.runs import read_runs
-from r2flow.reports.tables import Row, Table, print_table
+from r2flow.reports.tables import Part, Row, Table
 from r2flow.samplers import FixedSteps
 
 REPORT = "compare.md"  # the last file of a report
@@ -37,9 +34,7 @@ _COLUMNS = {
     "milliseconds": "ms a scan",
     "distance": "distance",
 }
-# What the ratio of two distances is called; 5 % count as equal.
-_RATIOS = (0.5, 0.95, 1.05, 2.0)
-_WORDS = ("far better than", "better than", "about as good as", "worse than", "far worse than")
+_CLEARLY = 0.95  # largest ratio of two distances that differ
 _NEXT = """
 next, with your own scans in FOLDER (.pcd, .ply, .bin, ...); step by step: docs/tutorial.md
   r2flow complete FOLDER --out dense                                     # add beams to them
@@ -59,9 +54,9 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
 
     `runs` are the folders by name of the link, in order.
     """
-    loaded = {name: load_checkpoint(run, device) for name, run in runs.items()}
-    first = next(iter(loaded.values()))
-    makers = {name: model for name, model in loaded.items() if model.generator.unconditional}
+    models = {name: load_checkpoint(run, device) for name, run in runs.items()}
+    first = next(iter(models.values()))
+    makers = {name: model for name, model in models.items() if model.generator.unconditional}
     name, last = list(makers.items())[-1]
     drawn = list(_drawn(makers, device))
     rows = [row for row, _ in drawn]
@@ -70,9 +65,9 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
     if rows[-1]["scans"] == DEFAULT:
         labels.append(f"{DEFAULT} (a larger model, included)")
     about = f"{', '.join(labels)}. An evaluation runs the network once."
-    said = []
     trained = ModelConfig({**last.config.stored, "data": first.config.stored.get("data")})
     then = what_next(runs[name], out, trained)
+    said = ""
     if sets := _scan_sets(first):
         unseen, training = sets
         drawn.insert(0, ({"scans": _GOAL}, training[:].numpy()))
@@ -89,17 +84,17 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
             f"better, 5 % is no difference; the best to expect is that of the {_GOAL}. The last "
             "row needs no network."
         )
-    page = compare_page({run.label: [run] for run in read_runs(list(runs.values()))})
-    page = replace(page, text=[about, Table(rows, _COLUMNS), "\n".join(said), *page.text])
+    text: list[Part] = [about, Table(rows, _COLUMNS), said]
     images = [scans[0] for _, scans in drawn]
-    page.figures["steps"] = contact_sheet(images, last.sensor.rays(), captions)
+    steps = contact_sheet(images, last.sensor.rays(), captions)
+    page = report_runs(list(runs.values()))
+    page = replace(page, text=[*text, *page.text], figures={**page.figures, "steps": steps})
     write_samples(last, out, num=4, seed=0, pictures=4, replace=True)
     *_, page_path = write_page(page, out)
-    print_table(rows, _COLUMNS, f"\n{about}")
-    print("", *said, sep="\n")
+    print()
+    print_text(text)
     print(
-        f"""
-look first    {out / "steps.png"}: one scan of each; black: no return
+        f"""look first    {out / "steps.png"}: one scan of each; black: no return
 in 3-D        {out / "samples.html"}: four scans of {name}, in a browser
 point clouds  {out / "000000.ply"} ... of {name}
 details       {page_path}
@@ -121,25 +116,24 @@ def _drawn(makers: Mapping[str, Checkpoint], device: str) -> Iterator[tuple[Row,
 
 
 def _samplers(generator: Generator) -> list[Sampler]:
-    own = generator.sampler
-    if generator.fixed or not hasattr(own, "steps"):
-        return [own]
-    few = "euler" if isinstance(own, FixedSteps) else None  # as distilled flows take them
-    return [generator.choose(few, steps=1), generator.choose(few, steps=2), own]
+    default = generator.sampler
+    if generator.fixed or not hasattr(default, "steps"):
+        return [default]
+    few = "euler" if isinstance(default, FixedSteps) else None  # as distilled flows take them
+    return [generator.choose(few, steps=1), generator.choose(few, steps=2), default]
 
 
 def _draw(model: Checkpoint, label: str, sampler: Sampler) -> tuple[Row, ndarray]:
     batches = list(sample(model, _SCANS, sampler=sampler, batch_size=8))
-    calls = float(np.mean([batch.evaluations.float().mean().item() for batch in batches]))
+    calls = torch.cat([batch.evaluations for batch in batches]).float().mean().item()
     row = {
         "scans": label,
         "title": f"{label} in {calls:g} evaluation{'s' * (calls != 1)}",
-        "solver": sampler.name,
         "calls": calls,
         "milliseconds": round(1000 * sum(batch.seconds for batch in batches) / _SCANS),
     }
-    images = [batch.images[:, :2].nan_to_num(0.0).numpy() for batch in batches]  # without labels
-    return row, np.concatenate(images)
+    images = torch.cat([batch.images[:, :2] for batch in batches])  # without labels
+    return row, images.nan_to_num(0.0).numpy()
 
 
 def _scan_sets(first: Checkpoint) -> tuple[ScanSet, ScanSet] | None:
@@ -174,33 +168,14 @@ def _with_distances(
     ]
 
 
-def _conclusion(rows: Sequence[Row], images: int) -> list[str]:
-    """What the distances say: of the flows next to the best baseline, of each next to the one
-    before at equal cost, and of the included model. `images`: seen by the first flow.
+def _conclusion(rows: Sequence[Row], images: int) -> str:
+    """What the distances of the flows say next to the best baseline; `images`: seen by the first
+    flow.
     """
-    flows = [row for row in rows if "calls" in row and row["scans"] != DEFAULT]
-    *_, baseline = rows
-    limit = _RATIOS[1] * baseline["distance"]
+    *others, baseline = rows
+    flows = [row for row in others if "calls" in row and row["scans"] != DEFAULT]
+    limit = _CLEARLY * baseline["distance"]
     near = [row["title"] for row in flows if row["distance"] < limit]
     about = f"{len(near)} of {len(flows)} are clearly better than {baseline['scans']}"
     names = f" ({', '.join(near)})" if near else ""
-    said = [f"After {images:,} images {about}{names}. Longer training helps."]
-    latest: dict[Any, Row] = {}  # by cost
-    for row in flows:
-        cost = row["solver"], row["calls"]
-        if cost in latest:
-            said.append(_compare(row, latest[cost]))
-        latest[cost] = row
-    best = min(flows, key=lambda row: row["distance"])
-    for row in rows:
-        if row["scans"] == DEFAULT:
-            seen = f"{DEFAULT} has seen over a million images."
-            said.append(f"{_compare(row, best | {'scans': best['title']})} {seen}")
-    return [f"- {sentence}" for sentence in said]
-
-
-def _compare(a: Row, b: Row) -> str:
-    """'rf2 (straightened) in 1 evaluation is better than rf1: 0.225 against 0.286.'"""
-    word = _WORDS[bisect(_RATIOS, a["distance"] / b["distance"])]
-    figures = f"{a['distance']:.3f} against {b['distance']:.3f}"
-    return f"{a['title']} is {word} {b['scans']}: {figures}."
+    return f"After {images:,} images {about}{names}. Longer training helps."

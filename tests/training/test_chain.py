@@ -154,21 +154,20 @@ def test_the_report_s_distance_of_the_held_out_scans_themselves_is_0(chained: tu
 
 def test_the_conclusion_follows_the_distances():
     def row(scans: str, distance: float, calls: float = 1.0) -> dict[str, object]:
-        cost = {"solver": "euler", "calls": calls}
-        return {"scans": scans, "title": f"{scans} in {calls:g}", "distance": distance, **cost}
+        return {
+            "scans": scans,
+            "title": f"{scans} in {calls:g}",
+            "distance": distance,
+            "calls": calls,
+        }
 
     rows = [row("a", 0.3), row("a", 0.2, 2.0), row("b", 0.1), row("b", 0.205, 2.0)]
     baseline = {"scans": "noise", "distance": 0.21}
-    told = [
-        "- After 2,400 images 1 of 4 are clearly better than noise (b in 1). Longer training helps.",
-        "- b in 1 is far better than a: 0.100 against 0.300.",
-        "- b in 2 is about as good as a: 0.205 against 0.200.",
-    ]
-    assert _conclusion([*rows, baseline], 2400) == told
-    included = _conclusion([*rows, row(DEFAULT, 0.3), baseline | {"distance": 0.1}], 2400)
-    assert "0 of 4 are clearly better than noise. " in included[0]
-    assert f"- {DEFAULT} in 1 is far worse than b in 1: 0.300 against 0.100." in included[3]
-    assert included[3].endswith("over a million images.")
+    said = _conclusion([*rows, row(DEFAULT, 0.01), baseline], 2400)
+    told = "After 2,400 images 1 of 4 are clearly better than noise (b in 1). "
+    assert said == f"{told}Longer training helps."
+    said = _conclusion([*rows, baseline | {"distance": 0.1}], 2400)
+    assert "0 of 4 are clearly better than noise. " in said
 
 
 def test_a_finished_chain_is_not_run_again(chained: tuple[Path, str], scans: Path, tmp_path: Path):
