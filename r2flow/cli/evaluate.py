@@ -55,21 +55,15 @@ def evaluate(
         check(
             not (options.json or options.out), "miou is printed alone: leave --json and --out out."
         )
-        return _evaluate_labels(real, named, (how.label_ids or "semantic_kitti").split(","))
+        from r2flow.reports.labels import label_tables
+        from r2flow.reports.pages import print_text
+
+        ids = (how.label_ids or "semantic_kitti").split(",")
+        for name in named:
+            print_text(label_tables(real, name, ids))
+        return
     with process_group(choose_device(options.device)) as device:
         _evaluate(real, named, options, how, device)
-
-
-def _evaluate_labels(real: str, named: Sequence[str], ids: Sequence[str]) -> None:
-    from r2flow.reports.labels import label_rows
-    from r2flow.reports.tables import print_table
-
-    for name in named:
-        rows, calibration = label_rows(real, name, ids)
-        print_table(rows, {"class": "class", "iou": "IoU", "points": "points"}, f"labels of {name}")
-        if calibration:
-            columns = {"said": "said", "right": "right", "points": "points"}
-            print_table(calibration, columns, "probability that a label is right")
 
 
 def _evaluate(

@@ -150,7 +150,7 @@ def judged_sets(
     from r2flow.reports.tables import short_names
 
     sets: dict[str, ScanSet] = {}
-    for text, name in zip(named, short_names(list(map(Path, named))), strict=True):
+    for text, name in zip(named, short_names(named), strict=True):
         if text in flows:
             sets |= _sampled(name, flows[text], options)
         else:
@@ -170,35 +170,35 @@ def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[
     generator = flow.generator
     names = split_samplers(options.sampler) if options.sampler else [None]
     counts = options.steps or [None]
-    chosen = {}
+    samplers = {}
     refused: InputError | None = None
     for name in names:
         known = vars(generator.sampler)
         if name is not None:
             known = options_of(SAMPLERS[parse_sampler(name)["name"]])
         for steps in counts:
-            given = SamplerOptions(name, steps, options.tolerance).given
+            fields = SamplerOptions(name, steps, options.tolerance).given
             if len(names) > 1 or len(counts) > 1:
-                given = {key: given[key] for key in given if key == "name" or key in known}
+                fields = {key: fields[key] for key in fields if key == "name" or key in known}
             try:
-                sampler = generator.choose(**given)
+                sampler = generator.choose(**fields)
             except InputError as error:
                 refused = error
                 continue
             curve = re.sub(":steps=[0-9]+", "", name) if name else ""
             line = f"{label}, {curve}" if len(names) > 1 else label
-            varied = len(counts) > 1 and "steps" in given
+            varied = len(counts) > 1 and "steps" in fields
             ending = str(sampler).removeprefix(sampler.name) if varied else ""
-            chosen[line + ending] = (line, sampler)
-    if refused and not chosen:
+            samplers[line + ending] = (line, sampler)
+    if refused and not samplers:
         if not generator.fixed:
             raise refused
         _log.warning("%s is distilled for %s alone", label, generator.sampler)
-        chosen = {label: (label, generator.sampler)}
+        samplers = {label: (label, generator.sampler)}
     num = options.num or _SAMPLED
     return {
         name: sampled_set(flow, line, num, sampler, options.seed, options.precision)
-        for name, (line, sampler) in chosen.items()
+        for name, (line, sampler) in samplers.items()
     }
 
 

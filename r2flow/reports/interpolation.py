@@ -50,7 +50,6 @@ def interpolation(
             "converged": bool(result.converged[number]),
         }
         rows.append(row)
-    captions = [f"w = {row['weight']:.2f}" for row in rows]
     errors = round_trip(checkpoint, result.ends)
     off = ", ".join(f"{error:.2g} m" for error in errors["median_m"].tolist())
     text: list[Part] = [
@@ -60,25 +59,19 @@ def interpolation(
         "include both directions.",
         Table(rows, {key: key for key in rows[0]}),
     ]
-    titles = [f"real: {name}" for name in names]
+    captions = [f"w = {row['weight']:.2f}" for row in rows]
+    first, last = (f"real: {name}" for name in names)
     real = pair.numpy()
-    first, last = (
-        Panel(title, image[None], rays) for title, image in zip(titles, real, strict=True)
-    )
-    chosen = spread(len(images), most_images(images.shape) - 2)
-    between = Panel("between", images[chosen], rays, None, [captions[n] for n in chosen])
-    write_viewer(out / "interpolation.html", [first, between, last], "Interpolation")
+    kept = spread(len(images), most_images(images.shape) - 2)
+    panels = [
+        Panel(first, real[:1], rays),
+        Panel("between", images[kept], rays, frames=[captions[number] for number in kept]),
+        Panel(last, real[1:], rays),
+    ]
+    write_viewer(out / "interpolation.html", panels, "Interpolation")
     drawn = spread(len(images), 8)
-    figure = contact_sheet(
-        [real[0], *images[drawn], real[1]],
-        rays,
-        [titles[0], *(captions[number] for number in drawn), titles[1]],
-    )
-    return Page(
-        "interpolation",
-        "Interpolation",
-        text,
-        rows,
-        {"interpolation": figure},
-        device=str(checkpoint.generator.device),
-    )
+    sheet = [real[0], *images[drawn], real[1]]
+    titles = [first, *(captions[number] for number in drawn), last]
+    figures = {"interpolation": contact_sheet(sheet, rays, titles)}
+    device = str(checkpoint.generator.device)
+    return Page("interpolation", "Interpolation", text, rows, figures, device=device)

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 from scipy.spatial import cKDTree
+from scipy.stats import sem
 from scipy.stats import t as student
 
-from r2flow.base.errors import InputError
+from r2flow.base.errors import InputError, check
 from r2flow.base.progress import track
 from r2flow.data.described import Described, describe
 from r2flow.lidar.labels import (
@@ -22,14 +23,14 @@ from r2flow.lidar.labels import (
 )
 from r2flow.lidar.scan_files import points_beside, read_points, scan_ending
 from r2flow.metrics.labels import class_ious, confusion, mean_iou
-from r2flow.reports.tables import Row
+from r2flow.reports.tables import Table
 
 SAME = 0.01  # metres between a true point and the labelled one
 BINS = 10  # of probability
 
 
-def label_rows(real: str, generated: str, ids: Sequence[str] = ()) -> tuple[list[Row], list[Row]]:
-    """Rows of IoU, a row a class, and of calibration, a row a tenth of probability.
+def label_tables(real: str, generated: str, ids: Sequence[str] = ()) -> list[Table]:
+    """IoU of each class, and of scans with probabilities how often these are right.
 
     Scans of the same name are compared at the points that both have. `ids` are lists of label ids:
     one of both, or those of the real and of the generated scans; r2flow's answers know theirs.
@@ -37,9 +38,9 @@ def label_rows(real: str, generated: str, ids: Sequence[str] = ()) -> tuple[list
     Raises:
         InputError: no scan of the same name with labels.
     """
-    sets = describe(real), describe(generated)
-    lists = [_ids_of(sets[0], ids[:1]), _ids_of(sets[1], ids[-1:])]
-    truth, found = map(_labelled, sets)
+    sides = describe(real), describe(generated)
+    lists = [_ids_of(sides[0], ids[:1]), _ids_of(sides[1], ids[-1:])]
+    truth, found = map(_labelled, sides)
     pairs = [*zip(truth.values(), found.values(), strict=False)]
     if len(truth) != 1 or len(found) != 1:
         pairs = [(truth[name], found[name]) for name in truth if name in found]
@@ -48,37 +49,36 @@ def label_rows(real: str, generated: str, ids: Sequence[str] = ()) -> tuple[list
             f"{real} and {generated} have no labelled scan of the same name; labels lie beside a "
             "scan, as 000000.label."
         )
-    total = np.zeros((len(COMMON) + 1, len(COMMON) + 1), np.int64)
-    sure = np.zeros((3, BINS))  # points, the sum of their probabilities, and the right ones
-    means = []
+    counts = []
+    probabilities = []  # and whether they were right
     for one, other in track(pairs, "comparing", "scans"):
         true, labels, probability = _matched(one, other, lists)
-        counts = confusion(true, labels)
-        if not counts.any():
-            raise InputError(f"{one} and {other} share no point with a label.")
-        total += counts
-        means.append(mean_iou(counts))
+        counts.append(confusion(true, labels))
+        check(counts[-1].any(), f"{one} and {other} share no point with a label.")
         if probability is not None:
-            p = probability[true > 0]
-            part = (p * BINS).astype(int).clip(0, BINS - 1)
-            right = (labels == true)[true > 0]
-            sure += [np.bincount(part, each, BINS) for each in (np.ones(len(p)), p, right)]
-    rows: list[Row] = [
-        {"class": name, "iou": iou, "points": int(count)}
-        for name, iou, count in zip(COMMON, class_ious(total), total[1:].sum(1), strict=True)
-    ]
-    rows.append({"class": "mean", "iou": mean_iou(total), "points": int(total.sum())})
-    rows.append({"class": "right", "iou": total.trace() / total.sum(), "points": int(total.sum())})
-    if len(means) > 1:
-        half = student.ppf(0.975, len(means) - 1) * np.std(means, ddof=1) / len(means) ** 0.5
-        text = f"mean of {len(means)} scans, +-{half:.3f}"
-        rows.append({"class": text, "iou": float(np.mean(means)), "points": int(total.sum())})
-    calibration = [
-        {"said": mean / count, "right": right / count, "points": int(count)}
-        for count, mean, right in sure.T
-        if count
-    ]
-    return rows, calibration
+            probabilities.append(np.stack([probability, labels == true])[:, true > 0])
+    total = np.sum(counts, axis=0)
+    points = int(total.sum())
+    classes = zip(COMMON, class_ious(total), total[1:].sum(1), strict=True)
+    rows = [(name, iou, int(count)) for name, iou, count in classes]
+    rows += [("mean", mean_iou(total), points), ("right", total.trace() / points, points)]
+    if len(counts) > 1:
+        means = [mean_iou(one) for one in counts]
+        half = student.ppf(0.975, len(means) - 1) * sem(means)
+        rows.append((f"mean of {len(means)} scans, +-{half:.3f}", float(np.mean(means)), points))
+    tables = [Table(rows, ("class", "IoU", "points"), f"labels of {generated}")]
+    if probabilities:
+        tables.append(_calibration(*np.concatenate(probabilities, axis=1)))
+    return tables
+
+
+def _calibration(probability: ndarray, right: ndarray) -> Table:
+    """How many of the labels are right, by tenths of their probability."""
+    part = (probability * BINS).astype(int).clip(0, BINS - 1)
+    count = np.bincount(part, minlength=BINS)
+    said, true = (np.bincount(part, values, BINS) for values in (probability, right))
+    rows = [(said[i] / count[i], true[i] / count[i], int(count[i])) for i in np.flatnonzero(count)]
+    return Table(rows, ("said", "right", "points"), "probability that a label is right")
 
 
 def _ids_of(scans: Described, ids: Sequence[str]) -> LabelList:

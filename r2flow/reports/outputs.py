@@ -89,22 +89,20 @@ def write_samples(
     evaluations = len(left) * (sampler.evaluations(generator) or 0)
     taken: list[int] = []  # evaluations of each scan
     with Bar("sampling", sum(map(len, left)), evaluations=evaluations) as bar:
-        done = 0
         for numbers in left:
             drawn = draw(generator, numbers, seed, sampler, None, region, precision, bar.evaluated)
             warn_unsolved(drawn.converged, numbers.start)
-            taken += drawn.evaluations.tolist()
             while stale:  # the first scan shows that the settings are valid
                 stale.pop().unlink()
-            if not (done and store.check()):  # `begin` lists the folder
+            if not (taken and store.check()):  # `begin` lists the folder
                 store.begin()
             images = drawn.images if labels is None else label(labels, drawn.images)
             for number, image in zip(numbers, images.numpy(), strict=True):
                 write_labelled(image, rays, store.folder, f"{number:06d}", endings, ids)
                 if number < pictures:
                     shown.append(image)
-            done += len(numbers)
-            bar.set(done)
+            taken += drawn.evaluations.tolist()
+            bar.set(len(taken))
     if taken and not evaluations:  # an adaptive sampler's differ
         each = ", ".join(map(str, taken[:16]))
         more = ", ..." if len(taken) > 16 else ""
