@@ -80,9 +80,9 @@ def _evaluate(
     from r2flow.model.checkpoint import load_checkpoint
 
     rules = PROTOCOLS[options.protocol]
-    chosen: dict[str, Any] = {}
+    named_metrics: dict[str, Any] = {}
     if options.metrics not in (None, "all"):
-        chosen = {name: METRICS[name]().to(device) for name in options.metrics.split(",")}
+        named_metrics = {name: METRICS[name]().to(device) for name in options.metrics.split(",")}
     flows = {name: load_checkpoint(name, device) for name in named if is_checkpoint(name)}
     files = {name: describe(name) for name in named if name not in flows}
     truths = describe(real, split=options.split)
@@ -90,14 +90,15 @@ def _evaluate(
     how = replace(how, convention=how.convention or rules.convention)
     specs = [truths, *files.values(), *([trained] if trained else [])]
     reading = reading_of(how, specs, list(flows.values()))
-    if chosen and not any(m.needs_reflectance or m.uses_reflectance for m in chosen.values()):
+    used = [m.needs_reflectance or m.uses_reflectance for m in named_metrics.values()]
+    if used and not any(used):
         reading = replace(reading, reflectance=False)  # else a scale would be required
     truth = open_set(truths, reading, options.real_num)
     rules.check(truth)
     judged = judged_sets(named, flows, files, reading, options)
     sets = [truth, *judged.values()]
     reflectance = all(scans.about.get("reflectance") for scans in sets)
-    metrics = chosen or possible_metrics(reflectance, options, device)
+    metrics = named_metrics or possible_metrics(reflectance, options, device)
     work = Work(options.batch_size, options.workers)
     cache = None if options.no_cache else Cache()
     results = options.out and options.out / "results"

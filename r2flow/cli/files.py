@@ -93,7 +93,7 @@ def export(
     if isinstance(loaded.generator, TransferFlow):
         if source is None:
             raise InputError("name the sensor of the scans: --from vlp16, or its YAML file.")
-        check(not (network or how.given), "densify is exported whole, as one jump.")
+        check(not (network or how.fields), "densify is exported whole, as one jump.")
         _export_completion(loaded, out, source, sensor, size)
         return
     check(
@@ -103,7 +103,7 @@ def export(
     # Other generators are refused whatever their sampler.
     sampler = None
     if isinstance(loaded.generator, RectifiedFlow):
-        sampler = loaded.generator.choose(**how.given)
+        sampler = loaded.generator.choose(**how.fields)
     written = writing.export(loaded, out, sampler, network)
     content = "the network v(t, x)" if network else sampler
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {content}")

@@ -118,6 +118,12 @@ def several(count: int, what: str = "scan") -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
+def print_model(name: str) -> None:
+    from r2flow.model.shipped import MODELS
+
+    print(f"the model {name}: {MODELS[name].about} (r2flow info {name})")
+
+
 def grouped(verb: Callable[..., None]) -> Callable[..., None]:
     """Expose each field of a verb's dataclass parameters to typer as an option.
 
@@ -136,11 +142,11 @@ def grouped(verb: Callable[..., None]) -> Callable[..., None]:
             parameters.append(parameter)
 
     @wraps(verb)
-    def call(**given: Any) -> None:
+    def call(**values: Any) -> None:
         for name, group in groups.items():
-            options = {field: given.pop(field) for field in inspect.signature(group).parameters}
-            given[name] = group(**options)
-        verb(**given)
+            options = {field: values.pop(field) for field in inspect.signature(group).parameters}
+            values[name] = group(**options)
+        verb(**values)
 
     keywords = [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in parameters]
     call.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
@@ -199,8 +205,8 @@ class SamplerOptions:
     grid: Annotated[str | None, Option(help="Time grid of fixed steps: uniform or power:P.")] = None
 
     @property
-    def given(self) -> dict[str, Any]:
-        """Given name and fields, as arguments of `Generator.choose`."""
+    def fields(self) -> dict[str, Any]:
+        """Name and fields that were set, as arguments of `Generator.choose`."""
         from r2flow.samplers import parse_sampler
 
         named = {} if self.sampler is None else parse_sampler(self.sampler)

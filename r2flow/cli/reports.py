@@ -168,7 +168,7 @@ def completion(
         size,
         reflectance_scale,
         device,
-        **how.given,
+        **how.fields,
     )
     _finish(page, out)
 

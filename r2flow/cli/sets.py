@@ -177,7 +177,7 @@ def _sampled(label: str, flow: "Checkpoint", options: EvaluateOptions) -> "dict[
         if name is not None:
             known = options_of(SAMPLERS[parse_sampler(name)["name"]])
         for steps in counts:
-            fields = SamplerOptions(name, steps, options.tolerance).given
+            fields = SamplerOptions(name, steps, options.tolerance).fields
             if len(names) > 1 or len(counts) > 1:
                 fields = {key: fields[key] for key in fields if key == "name" or key in known}
             try:

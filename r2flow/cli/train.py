@@ -78,7 +78,7 @@ def pairs(
     flow = parent.checkpoint
     record = parent.record()
     options = {
-        "sampler": {"name": "adams3", **how.given},
+        "sampler": {"name": "adams3", **how.fields},
         "precision": precision,
         "num": num,
         "batch_size": batch_size,
@@ -87,9 +87,9 @@ def pairs(
         "parent": record.weights,
         "first": record.first_pair,
     }
-    chosen = construct("pairs", PairOptions, options)
+    pairing = construct("pairs", PairOptions, options)
     folder = out or default_folder(flow.path)
-    store = PairStore(folder, chosen, flow.encoding.shape, flow.generator.noise_shape)
+    store = PairStore(folder, pairing, flow.encoding.shape, flow.generator.noise_shape)
     make_pairs(store, flow.generator.to(where), wait=False)
     missing = store.missing_pairs()
     if missing:

@@ -20,7 +20,7 @@ from r2flow.base.errors import (
 )
 from r2flow.base.plugins import load_plugins, take_plugins
 from r2flow.base.signals import Stopped, handling_signals, stop_at_once
-from r2flow.cli import ablate, data, draw, evaluate, files, reports, train, view  # noqa: F401 (each registers its verbs)
+from r2flow.cli import ablate, complete, data, draw, evaluate, files, reports, train, view  # noqa: F401 (each registers its verbs)
 from r2flow.cli.app import app
 
 # ClickException: in click for older releases of typer, in typer for newer ones.

@@ -112,13 +112,13 @@ def measure_run(run: str, judge: Judge, evaluations: Sequence[int] | None) -> li
 
 def _samplers(generator: Generator, evaluations: Sequence[int] | None) -> list[Sampler]:
     default = generator.sampler
-    chosen = {default.name: evaluations} if evaluations else _SYSTEMS.get(default.name, {})
+    counts = {default.name: evaluations} if evaluations else _SYSTEMS.get(default.name, {})
     if generator.fixed:
         kept = not evaluations or default.evaluations(generator) in evaluations
         return [default] if kept else []
-    return [
-        generator.choose(name, steps=steps) for name, counts in chosen.items() for steps in counts
-    ] or [default]
+    return [generator.choose(name, steps=steps) for name in counts for steps in counts[name]] or [
+        default
+    ]
 
 
 def _drawn(checkpoint: Checkpoint, num: int, sampler: Sampler) -> tuple[Tensor, Row]:

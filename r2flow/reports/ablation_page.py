@@ -112,11 +112,11 @@ def ablation_page(
     systems: dict[str, list[Row]] = {}
     learned: dict[str, Row] = {}
     for name in names:
-        own = [row for row in rows if row["combination"] == name]
-        systems[name] = over_seeds(row for row in own if row["budget"] == budget)
+        runs = [row for row in rows if row["combination"] == name]
+        systems[name] = over_seeds(row for row in runs if row["budget"] == budget)
         learned[name] = {"combination": name}
-        for seconds in sorted({row["budget"] for row in own}):
-            distances = [row[DISTANCE] for row in own if row["budget"] == seconds]
+        for seconds in sorted({row["budget"] for row in runs}):
+            distances = [row[DISTANCE] for row in runs if row["budget"] == seconds]
             learned[name][f"{seconds / 60:.3g} min"] = min(distances)
     lines = [references[0], *(row for each in systems.values() for row in each), last]
     against = compared(systems)

@@ -48,14 +48,14 @@ def complete_recording(
         InputError: No cloud can be completed, or `out` is of other settings.
     """
     with open_recording(path) as recording:
-        chosen = choose_topic(recording, topic)
-        of_topic = [channel for channel in recording.channels if channel.topic == chosen]
+        topic = choose_topic(recording, topic)
+        of_topic = [channel for channel in recording.channels if channel.topic == topic]
         kept = recording
         if not everything:
             kept = replace(recording, channels=tuple(of_topic), attachments=tuple, metadata=tuple)
         check_ending(out, kept)
         recipe = {
-            **recipe, "recording": _identity(path), "topic": chosen, "everything": everything
+            **recipe, "recording": _identity(path), "topic": topic, "everything": everything
         }  # fmt: skip
         store = Store(out.with_name(f"{out.name}.parts"), "completed clouds", recipe)
         notes = out.with_name(f"{out.name}.json")
@@ -66,15 +66,15 @@ def complete_recording(
             return
         count = sum(channel.count for channel in of_topic if channel.kind == CLOUD)
         store.begin()
-        done, added = _make_parts(recording, chosen, complete, store, count)
+        done, added = _make_parts(recording, topic, complete, store, count)
         write_file(notes, json.dumps({"recipe": store.described, "completed": done}, indent=1))
         total = count if not everything else sum(one.count for one in recording.channels)
-        messages = _replaced(recording, None if everything else chosen, chosen, store)
+        messages = _replaced(recording, None if everything else topic, topic, store)
         write_recording(out, kept, track(messages, "writing", "messages", total))
         shutil.rmtree(store.folder)
     left = f", {count - done} left as they are" if done < count else ""
     print(
-        f"{out}: {done} clouds of {chosen} completed{left}, {added / done:,.0f} new points a cloud"
+        f"{out}: {done} clouds of {topic} completed{left}, {added / done:,.0f} new points a cloud"
     )
 
 
