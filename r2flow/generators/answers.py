@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -18,7 +19,7 @@ HIT = 0.1  # metres
 # probabilities are interpolated: on scans they are then wrong by 1 % in the mean.
 WIDTHS = (1 / 32, 1 / 8, 1 / 3, 1.0, 2.5)
 _WIDEST = 5.0  # largest width: nothing is known of such a ray
-_RAYS = 8192  # of a block: what is computed of them stays in a core's cache
+RAYS = 8192  # of a block: what is computed of them stays in a core's cache
 FAINT = 0.1  # reflectance of training, below which differences are as errors, not as ratios
 
 
@@ -54,6 +55,18 @@ class Answers:
             strengths=strengths,
             labels=labels,
         )
+
+    def of(self, rays: Tensor) -> "Answers":
+        """Those of some rays, (1, C, 1, N), by their places in the flat images, (N,)."""
+        images = self.returns.shape
+
+        def some(values: Any) -> Any:
+            if not isinstance(values, Tensor):
+                return values
+            flat = values.expand(-1, -1, *images[2:]).movedim(1, 0).flatten(1)
+            return flat.index_select(1, rays)[None, :, None]
+
+        return Answers(*map(some, vars(self).values()))
 
     def log_density(self, log_r: Tensor) -> Tensor:
         """log p(log r | return), (B, 1, H, W)."""
@@ -135,7 +148,7 @@ class Answers:
         errors = r.new_zeros(len(levels), r.numel())
         wanted = [math.log(-math.log1p(-level)) for level in levels]
         density = [x.movedim(1, 0).flatten(1) for x in (self.logits, self.ranges, self.scales)]
-        for rays in asked.split(_RAYS):
+        for rays in asked.split(RAYS):
             metres = r.flatten()[rays]
             logits, ranges, scales = (x.index_select(1, rays) for x in density)
             if self.calibration is not None:

@@ -17,7 +17,7 @@ from r2flow.base.registry import NonNegative
 from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.path import expand_time
 from r2flow.flow.solvers.solution import wide
-from r2flow.generators.answers import FAINT, NEVER, Answers, smoothed
+from r2flow.generators.answers import FAINT, NEVER, RAYS, Answers, smoothed
 from r2flow.generators.base import (
     IMAGE,
     KNOWN,
@@ -280,28 +280,22 @@ class TransferFlow(Flow):
         near = self._rows_near(asked)
         part = {name: value[:, :, near] for name, value in condition.items() if value.shape[2] > 1}
         answers = self._answered(t, x[:, :, near], {**condition, **part})
-        likely = asked[:, :, near] & (answers.returns > 0)
-        ray = likely.flatten().nonzero()[:, 0]
-
-        def rays(values: Any) -> Any:
-            """Those of the rays, (1, C, 1, N), of (B, C, H, W)."""
-            if not isinstance(values, Tensor):
-                return values
-            every = values.expand(-1, -1, *likely.shape[2:]).movedim(1, 0).flatten(1)
-            return every.index_select(1, ray)[None, :, None]
-
-        x_1 = self._empty(known[:, :1]).clone()
-        returned = x_1[:, :, near].movedim(1, 0).flatten(1).clone()
-        returned[:, ray] = self._chosen(Answers(*map(rays, vars(answers).values())))[0, :, 0]
-        x_1[:, :, near] = returned.unflatten(1, (len(x_1), *likely.shape[2:])).movedim(1, 0)
+        likely = (asked[:, :, near] & (answers.returns > 0)).flatten().nonzero()[:, 0]
+        x_1 = self._empty(known[:, :1])
+        flat = x_1[:, :, near].movedim(1, 0).flatten(1).clone()
+        for rays in likely.split(RAYS):
+            flat[:, rays] = self._chosen(answers.of(rays))[0, :, 0]
+        x_1[:, :, near] = flat.unflatten(1, (len(x_1), -1, x_1.shape[3])).movedim(1, 0)
         self.density = answers.among(x_1.shape[2], near)
         return x_1
 
     def _rows_near(self, asked: Tensor) -> slice:
         """The rows that the network needs to answer the rays asked, (B, 1, H, W)."""
         rows = asked.shape[2]
+        if self.backbone.radius is None or torch.compiler.is_exporting():
+            return slice(0, rows)
         number = asked.any(3).any(0)[0].nonzero()[:, 0].tolist() or [0]
-        radius = rows if self.backbone.radius is None else self.backbone.radius
+        radius = self.backbone.radius
         return slice(max(number[0] - radius, 0), min(number[-1] + radius + 1, rows))
 
     def _share(self, condition: Condition, noise: Tensor, steps: Tensor) -> Tensor:
@@ -317,11 +311,16 @@ class TransferFlow(Flow):
         hidden = every_second(known[:, :1])
         kept = known * ~hidden
         about = Surroundings.of(self.space, {IMAGE: image, KNOWN: kept}, False, steps, gain)
-        inputs = self._inputs(about.start + (kept < 1) * noise, about, condition["rows"])
-        output = self.backbone(torch.zeros((), device=noise.device), inputs).float()
         metres = self.space.decode(image)
         heard = known[:, 1][:, None] > 0  # not a slice: OpenVINO 2026.4 refuses the exported graph
         compared = hidden & heard & (metres[:, :1] > 0)
+        near = self._rows_near(compared)
+        compared, metres, kept, noise, rows = (
+            x[:, :, near] for x in (compared, metres, kept, noise, condition["rows"])
+        )
+        about = Surroundings(*(x[:, :, near] for x in about))
+        inputs = self._inputs(about.start + (kept < 1) * noise, about, rows)
+        output = self.backbone(torch.zeros((), device=noise.device), inputs).float()
         error = metres[:, 1:2] - self._read(output, about, gain, 0.0).strength()
         correction = output[:, _STRENGTH] / gain
         shares = torch.linspace(1, 0, 11, device=noise.device)
