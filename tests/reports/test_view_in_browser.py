@@ -133,11 +133,12 @@ def points_of(image: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
     return {place: image_to_points(one, RAYS)[0][0] for place, one in alone.items()}
 
 
-def colour_of_range(r: float) -> np.ndarray:
-    """As the pictures of the project have it: turbo from 0.93 (2 m) down to 0.1 (80 m), by the
-    logarithm.
+def colour_of_range(r: float, ranges: list[float]) -> np.ndarray:
+    """As the pictures of the project have it: turbo from 0.93 down to 0.1 by the logarithm, from
+    0.9 of the 2 % quantile of a page's ranges to 1.1 of that at 98 %.
     """
-    share = int(np.clip(math.log(r / 2) / math.log(40) * 256, 0, 255)) / 255
+    near, far = np.quantile(ranges, (0.02, 0.98)) * (0.9, 1.1)
+    share = int(np.clip(math.log(r / near) / math.log(far / near) * 256, 0, 255)) / 255
     return 255 * np.array(colormaps["turbo"](0.9 - 0.83 * share)[:3])
 
 
@@ -161,7 +162,8 @@ def test_points_are_drawn_where_the_camera_sees_them_in_the_colour_of_their_rang
             continue
         drawn += 1
         at = pixels[round(y - 0.5), round(x - 0.5)]
-        assert np.abs(at - colour_of_range(PIXELS[place])).max() <= 4, (place, at)
+        expected = colour_of_range(PIXELS[place], [*PIXELS.values()])
+        assert np.abs(at - expected).max() <= 4, (place, at)
         # 30 pixels above and below: the background
         around = pixels[round(y) - 30 : round(y) + 30 : 59, round(x)]
         assert (around.max(axis=1) < 45).all()
@@ -177,7 +179,7 @@ def test_the_image_below_is_the_range_image(opened):
     for (row, column), r in np.ndenumerate(image[0]):
         x = box["x"] + (column + 0.5) / 64 * box["width"]
         y = box["y"] + 1 + (row + 0.5) / 16 * (box["height"] - 1)
-        expected = colour_of_range(r) if r else np.zeros(3)
+        expected = colour_of_range(r, image[image > 0].tolist()) if r else np.zeros(3)
         assert np.abs(pixels[int(y), int(x)] - expected).max() <= 4, (row, column)
 
 
@@ -267,8 +269,8 @@ def test_only_what_is_there_can_be_coloured(opened):
     assert shown.locator("#modes button").all_inner_texts() == ["range", "height"]
     assert shown.locator("#player").is_hidden()
     colour_by(shown, "range")
-    # sqrt(2 x 80) between
-    assert shown.locator("#legend span").all_inner_texts() == ["range 2 m", "12.6 m", "80 m"]
+    # 0.9 of 5.32 m (2 %), 1.1 of 30.28 m (98 %), and the root of their product between
+    assert shown.locator("#legend span").all_inner_texts() == ["range 4.8 m", "13 m", "33 m"]
     shown = opened(panel(lone(), labels=np.full((1, *SENSOR.shape), 40)))
     colour_by(shown, "label")
     assert shown.locator("#legend span").all_inner_texts() == ["road", "no class"]
