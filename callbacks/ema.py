@@ -11,7 +11,7 @@ from torch import Tensor
 from r2flow.base.registry import Count, Natural, Portion, Positive, Registry
 
 # Decays, at most `decay`, of n = 1, 2, ..., the steps after the warm-up, during which it is 0.
-DECAYS: Registry[Callable[[int], float]] = Registry(
+_DECAYS: Registry[Callable[[int], float]] = Registry(
     "decay of the average",
     power=lambda n: 1 - n ** (-2 / 3),
     constant=lambda n: 1.0,  # LiDARGen
@@ -27,7 +27,7 @@ class EMA(WeightAveraging):
 
     Args:
         decay: Highest decay.
-        rule: Decay schedule, a name in `DECAYS`; `ratio` and `constant` are meant for every=1.
+        rule: Decay schedule, a name in `_DECAYS`; `ratio` and `constant` are meant for every=1.
         every: Steps between two updates.
         warmup_steps: Steps during which the average copies the weights; None: the stage's
             learning-rate warm-up.
@@ -46,7 +46,7 @@ class EMA(WeightAveraging):
         self.decay = decay
         self.every = every
         self.warmup_steps = warmup_steps
-        DECAYS[rule]  # refuses an unknown name
+        _DECAYS[rule]  # refuses an unknown name
         self.rule = rule  # a function without a name cannot be pickled
         self._step = 0
         self._end: float = -1
@@ -55,7 +55,7 @@ class EMA(WeightAveraging):
     def _decay(self) -> float:
         """Decay after step `_step`, counted from 0."""
         n = self._step + 1 - (self.warmup_steps or 0)
-        return 0.0 if self._copies or n < 1 else min(self.decay, DECAYS[self.rule](n))
+        return 0.0 if self._copies or n < 1 else min(self.decay, _DECAYS[self.rule](n))
 
     def _average(self, average: Tensor, weight: Tensor, updates: Any) -> Tensor:
         return average.lerp(weight, 1 - self._decay())

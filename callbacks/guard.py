@@ -17,7 +17,7 @@ from r2flow.base.signals import wait_for_launcher
 from r2flow.data.loader import RunSampler
 from r2flow.model.paths import checkpoints_of
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class Guard(L.Callback):
@@ -95,7 +95,7 @@ class Guard(L.Callback):
                 "a run of another name, a lower stage.learning_rate.",
             )
         if trainer.is_global_zero and not overflow:
-            log.warning(
+            _log.warning(
                 "step %d skipped: non-finite gradient, loss %g (%d in a row; the run ends at %d)",
                 step, loss, self.in_a_row, self.skips,
             )  # fmt: skip

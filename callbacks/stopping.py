@@ -28,7 +28,7 @@ from r2flow.model.paths import checkpoints_of
 
 from .checkpoints import Checkpoints
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class Stopping(L.Callback):
@@ -125,7 +125,7 @@ class Stopping(L.Callback):
         if self.received == signal.SIGUSR1:
             code = LATER
             if first:
-                log.info("%s; scontrol requeue %s", where, self.job)
+                _log.info("%s; scontrol requeue %s", where, self.job)
                 try:
                     subprocess.run(["scontrol", "requeue", str(self.job)], check=True)
                 except (OSError, subprocess.CalledProcessError) as error:

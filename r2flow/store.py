@@ -37,7 +37,7 @@ from r2flow.base.pool import attempts_of
 from r2flow.base.registry import Config, Options
 from r2flow.lidar.scan_files import FIRM_ENDINGS
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 MANIFEST = "manifest.json"
 _PATIENCE = 0.2  # seconds between polls of items that other processes make
@@ -196,7 +196,7 @@ class Store:
             pass
         except Damaged as error:
             path = self.file(item)
-            log.warning("%s is damaged (%s): it is made again.", path, error)
+            _log.warning("%s is damaged (%s): it is made again.", path, error)
             path.unlink(missing_ok=True)
 
     def make(
@@ -231,7 +231,7 @@ class Store:
                 time.sleep(_PATIENCE)
             if waiting and time.monotonic() - since > QUIET:
                 since = math.inf  # log once
-                log.warning("waiting for another process, which makes %s", self.file(waiting[0]))
+                _log.warning("waiting for another process, which makes %s", self.file(waiting[0]))
             left = waiting
 
     def attempt(self, item: int, work: Callable[[int], None]) -> bool:

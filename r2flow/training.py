@@ -42,7 +42,7 @@ from r2flow.runs.folder import has_ended, open_run, run_lock
 
 __all__ = ["Result", "Run", "RunConfig", "build", "check", "compose", "fit"]
 
-log = logging.getLogger("r2flow")
+_log = logging.getLogger("r2flow")
 
 # Errors of gloo and NCCL after a peer process has ended.
 _PEER_LOST = (
@@ -87,7 +87,7 @@ def fit(run: Run) -> Result:
         with quiet():
             run.data.setup()
             run.config = replace(run.config, scans=run.data.fingerprint())
-            log.info("training on %s", run.data.summary())
+            _log.info("training on %s", run.data.summary())
             if first and not run.folder.exists():
                 check_folder(run.folder)
                 run.data.read()  # a bad scan leaves no folder
@@ -117,7 +117,7 @@ def _fit_in_folder(run: Run, stopping: Stopping) -> int:
     with quiet():
         run.data.read()
         if last is not None:
-            log.info("resuming from %s", last)
+            _log.info("resuming from %s", last)
     if first:
         log_config(run.trainer.loggers, run.config.plain())
     try:

@@ -10,7 +10,7 @@ from r2flow.backbones.layers import ExactBuffers, at_least_float32
 from r2flow.base.errors import InputError
 from r2flow.base.registry import Positive, Size
 
-Prediction = Literal["velocity", "data", "noise"]
+_Prediction = Literal["velocity", "data", "noise"]
 
 
 class Backbone(ExactBuffers):
@@ -64,7 +64,7 @@ class Backbone(ExactBuffers):
         in_channels: int = 2,
         out_channels: int | None = None,
         second_time: bool = False,
-        prediction: Prediction = "velocity",
+        prediction: _Prediction = "velocity",
         data_std: Positive | None = None,
     ) -> None:
         super().__init__()
@@ -200,7 +200,7 @@ def precondition(t: Tensor, data_std: float) -> tuple[Tensor, Tensor, Tensor]:
     return into, (t * data_std**2 - (1 - t)) / variance, data_std * into
 
 
-def _reparametrise(t: Tensor, prediction: Prediction) -> tuple[Tensor, Tensor]:
+def _reparametrise(t: Tensor, prediction: _Prediction) -> tuple[Tensor, Tensor]:
     """Factors of a network F that predicts x_1 (`data`) or x_0 (`noise`), (B or 1, 1, 1, 1) each:
 
         v(t, x) = skip(t) x + out(t) F(t, x)

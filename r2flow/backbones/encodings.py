@@ -72,7 +72,7 @@ class FourierFeatures(RayEncoding):
         return torch.cat([theta.sin(), theta.cos()], dim=1)
 
 
-class Polar(RayEncoding):
+class _Polar(RayEncoding):
     """The two angles, unchanged."""
 
     channels = 2
@@ -120,7 +120,7 @@ def _legendre(l: int, m: int, e: Tensor) -> Tensor:  # noqa: E741
 ENCODINGS: Registry[type[RayEncoding]] = Registry(
     "position",
     fourier_features=FourierFeatures,
-    polar=Polar,
+    polar=_Polar,
     spherical_harmonics=SphericalHarmonics,
 )
 

@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _LONGEST = 4000  # characters of a message
 IN_MEMORY = "points in memory"  # the name of points without a file
@@ -101,7 +101,7 @@ def warn_odd(path: Path, kind: str, points: int = 0) -> None:
     if (folder, kind) not in _warned:
         _warned.add((folder, kind))
         number = f" ({points:,} points; reported once per folder)" if points else ""
-        log.warning("%s: %s%s", path, kind, number)
+        _log.warning("%s: %s%s", path, kind, number)
 
 
 def explain_mistake(error: InputError | OSError) -> str:

@@ -16,11 +16,11 @@ from typing import Any
 from r2flow.base.errors import InputError
 from r2flow.base.signals import blocking_signals, code_of, end_with_parent
 
-Work = Callable[[int], None]
+_Work = Callable[[int], None]
 
 
 def attempts_of(
-    store: Any, items: list[int], work: Work, workers: int
+    store: Any, items: list[int], work: _Work, workers: int
 ) -> Generator[tuple[int, bool]]:
     """`Store.attempt` of each item in `workers` processes (1: this one): items and results, as they
     come.

@@ -78,7 +78,7 @@ class Bar(Progress):
             self._printed = now
             # not those begun
             counted = f"{self._doing} {int(task.completed + 1e-6)}/{task.total:.0f} {self._unit}"
-            left = duration(task.time_remaining or 0)
+            left = _duration(task.time_remaining or 0)
             line = f"{counted}  {task.speed:.2f}/s  {left} left  {task.fields['note']}"
             print(line.rstrip(), file=sys.stderr, flush=True)
 
@@ -114,7 +114,7 @@ def track(
             bar()
 
 
-def duration(seconds: float) -> str:
+def _duration(seconds: float) -> str:
     """75 -> '1:15', 3700 -> '1:01:40'."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)

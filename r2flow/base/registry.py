@@ -35,13 +35,13 @@ from typing_extensions import TypedDict  # pydantic needs this one before Python
 
 from r2flow.base.errors import InputError, quoted
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 Options = Mapping[str, Any]  # of a config, by key
 Config = dict[str, Any]  # a config, or a part of one
 
 MISSING = "???"  # OmegaConf's mandatory value
-STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
+_STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
 
 
 def _refuse_bool(value: Any) -> Any:
@@ -62,7 +62,7 @@ Share = Annotated[Number, Field(ge=0, le=1)]
 Counts = Annotated[Sequence[Count], Field(min_length=1)]
 Size = tuple[Count, Count]  # rows and columns
 
-strict = with_config(STRICT)  # decorates a dataclass of options: no unknown ones, no NaN
+strict = with_config(_STRICT)  # decorates a dataclass of options: no unknown ones, no NaN
 
 
 def Bound(words: str, holds: Callable[[Any], bool]) -> AfterValidator:
@@ -108,7 +108,7 @@ def lazy(place: str, *given: Any) -> Any:
     return _Lazy(place, given)
 
 
-class Registry(Mapping[str, T]):
+class Registry(Mapping[str, _T]):
     """Named values of one kind, and the names of the files in conf/KIND/, which stand for one of
     them with options.
 
@@ -124,11 +124,11 @@ class Registry(Mapping[str, T]):
 
     on_missing: ClassVar[list[Callable[[], None]]] = []
 
-    def __init__(self, kind: str, **entries: T) -> None:
+    def __init__(self, kind: str, **entries: _T) -> None:
         self.kind = kind
         self._entries = dict(entries)
 
-    def __getitem__(self, name: str) -> T:
+    def __getitem__(self, name: str) -> _T:
         if name not in self:
             names = sorted({*self, *presets(self.kind)})
             hint = did_you_mean(str(name), names)
@@ -156,7 +156,7 @@ class Registry(Mapping[str, T]):
     def __repr__(self) -> str:
         return f"Registry({self.kind}: {', '.join(self)})"
 
-    def add(self, name: str, entry: T) -> None:
+    def add(self, name: str, entry: _T) -> None:
         """Add an entry; raises ValueError for a name that is taken, except by a former run of a
         notebook's cell.
         """
@@ -234,7 +234,7 @@ def check_options(
         return _schema(constructor, given).validate_python(dict(options))
 
 
-def construct(what: str, constructor: Callable[..., T], options: Options | None, *args: Any) -> T:
+def construct(what: str, constructor: Callable[..., _T], options: Options | None, *args: Any) -> _T:
     """Call a constructor with `args` and checked options of a config; None: its defaults."""
     checked = check_options(what, constructor, options or {}, given=len(args))
     with _in_one_line(what, constructor, checked, len(args)):  # a strict dataclass checks, too
@@ -299,10 +299,10 @@ def _schema(constructor: Callable[..., Any], given: int) -> TypeAdapter[Config]:
         annotation = Any if parameter.annotation is parameter.empty else parameter.annotation
         required = parameter.default is parameter.empty
         fields[name] = Required[annotation] if required else NotRequired[annotation]
-    config = STRICT
+    config = _STRICT
     kinds = [p.kind for p in inspect.signature(constructor).parameters.values()]
     if inspect.Parameter.VAR_KEYWORD in kinds and not inspect.isclass(constructor):
-        config = ConfigDict(**{**STRICT, "extra": "allow"})
+        config = ConfigDict(**{**_STRICT, "extra": "allow"})
     typed_dict: Any = TypedDict  # of fields that are known now alone
     schema: Any = with_config(config)(typed_dict("options", fields))
     return TypeAdapter(schema)

@@ -14,7 +14,7 @@ from r2flow.cli.options import SETS, DeviceOption, OutOption, parse_counts, seve
 _UNITS = {"": 1, "s": 1, "min": 60, "h": 3600}
 
 
-def parse_duration(text: str) -> float:
+def _parse_duration(text: str) -> float:
     """Seconds of a duration such as 10min, 90s or 1.5h."""
     found = re.fullmatch(r"(\d+\.?\d*) *(s|min|h|)", text)
     if found is None or float(found[1]) == 0:
@@ -35,7 +35,7 @@ def ablate(
     budget: Annotated[
         Any,
         Option(
-            parser=parse_duration,
+            parser=_parse_duration,
             metavar="TIME",
             help="Training time of all runs together, as 10min or 2h. Measuring comes on top.",
         ),

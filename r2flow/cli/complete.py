@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class PartialOptions:
+class _PartialOptions:
     """The scans to complete: their sensor, what is known of them, and the sensor of the completed
     scans.
     """
@@ -136,7 +136,7 @@ def complete(
         ),
     ],
     out: OutOption,
-    part: PartialOptions,
+    part: _PartialOptions,
     how: SamplerOptions,
     checkpoint: Annotated[
         str | None,
@@ -232,7 +232,7 @@ def complete(
 def _complete_recording(
     path: Path,
     out: Path,
-    part: PartialOptions,
+    part: _PartialOptions,
     how: SamplerOptions,
     model: "Checkpoint",
     precision: "Precision | None",

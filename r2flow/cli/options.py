@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 # typer makes a usage error of a ValueError.
 
 
-def parse_size(text: str) -> tuple[int, int]:
+def _parse_size(text: str) -> tuple[int, int]:
     """Rows and columns of an image size such as 64x1024."""
     rows, columns = parse_counts(text.lower().replace("x", ","))
     return rows, columns
 
 
-def parse_columns(text: str) -> tuple[str, ...]:
+def _parse_columns(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(","))
 
 
@@ -47,7 +47,7 @@ SensorOption = Annotated[str, Option(help="Sensor name or YAML file (see r2flow 
 SizeOption = Annotated[
     Any,
     Option(
-        parser=parse_size,
+        parser=_parse_size,
         metavar="ROWSxCOLUMNS",
         help="Image size, such as 64x1024. Default: the sensor's.",
     ),
@@ -66,7 +66,7 @@ ScaleChoice = Annotated[
 ColumnsOption = Annotated[
     Any,
     Option(
-        parser=parse_columns,
+        parser=_parse_columns,
         metavar="NAMES",
         help="All columns of scan files without names, such as x,y,z,intensity,_; of files with "
         "names those to rename, such as intensities=reflectance. Default: the format's.",
@@ -93,7 +93,7 @@ BatchOption = Annotated[int, Option(min=1, help="Scans per batch.")]
 MostOption = Annotated[int, Option("--num", min=1, help="Maximum number of scans per folder.")]
 WorkersOption = Annotated[int | None, Option(min=1, help="Processes. Default: one per core.")]
 SplitOption = Annotated[str | None, Option(help="Part of the data set's standard split.")]
-StepsOption = Annotated[
+_StepsOption = Annotated[
     int | None, Option(min=1, help="Steps from noise to data, for fixed-step samplers.")
 ]
 StepsList = Annotated[
@@ -200,7 +200,7 @@ class SamplerOptions:
             "completion: transport, mmps, replace, repaint. For other systems see docs/systems.md."
         ),
     ] = None
-    steps: StepsOption = None
+    steps: _StepsOption = None
     tolerance: ToleranceOption = None
     grid: Annotated[str | None, Option(help="Time grid of fixed steps: uniform or power:P.")] = None
 

@@ -46,9 +46,9 @@ from r2flow.data.sources import holdout_block, spread
 from r2flow.lidar.encoding import Encoding, encoding_options
 from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
-HeldOut = DataLoader[Item] | list[Any]  # an empty list: there are none
+_HeldOut = DataLoader[Item] | list[Any]  # an empty list: there are none
 
 
 class ScanDataModule(L.LightningDataModule, NamedArguments):
@@ -168,7 +168,7 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
             held_out = [self.plan.held_out] if self.plan.held_out else []
             lacking = lacking_reflectance([*self.plan.sets, *held_out])
             if lacking:
-                log.info("range alone is learned (encoding.reflectance=auto): %s", lacking)
+                _log.info("range alone is learned (encoding.reflectance=auto): %s", lacking)
             options["reflectance"] = lacking is None
         if options["levels"] is None and self.plan.sets:
             options["levels"] = reflectance_levels(self.plan.sets)
@@ -358,15 +358,15 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
         sensors = self.plan.sensors if whole_sets else []
         return FlowDataset(source, item_format, self.seed, purpose, augment, sensors)
 
-    def val_dataloader(self) -> HeldOut:
+    def val_dataloader(self) -> _HeldOut:
         """The held-out scans, each once over all devices."""
         return self._held_out()
 
-    def test_dataloader(self) -> HeldOut:
+    def test_dataloader(self) -> _HeldOut:
         """The held-out scans, each once over all devices, to compare generated scans with."""
         return self._held_out(whole=True)
 
-    def predict_dataloader(self) -> HeldOut:
+    def predict_dataloader(self) -> _HeldOut:
         """The held-out scans, each once over all devices, some of which may have none."""
         return self._held_out(whole=True, idle=True)
 
@@ -376,7 +376,7 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
         _, source = self._ready()
         return len(source) >= self.ranks[1]
 
-    def _held_out(self, whole: bool = False, idle: bool = False) -> HeldOut:
+    def _held_out(self, whole: bool = False, idle: bool = False) -> _HeldOut:
         """Batches of the held-out scans; `whole`: without the stage's further entries; `idle`:
         devices may have none.
         """

@@ -19,7 +19,7 @@ from r2flow.lidar.sensors import Sensor
 from r2flow.model.shipped import MODELS
 from r2flow.store import MANIFEST, manifest_of
 
-SCENES = 1000  # default number of simulated scans
+_SCENES = 1000  # default number of simulated scans
 
 
 @dataclass(eq=False)
@@ -171,7 +171,7 @@ def describe(spec: Spec, **options: Any) -> Described:
             raise InputError(
                 f"simulated scans are named by their seed, as simulated:0; found {text!r}."
             )
-        scenes = {"scenes": SCENES, **options}
+        scenes = {"scenes": _SCENES, **options}
         return Described(text, SourceOptions(kind, **scenes), seed=int(root))
     if colon and kind in SOURCES:
         return Described(text, SourceOptions(kind, root, **options))

@@ -17,7 +17,7 @@ from r2flow.lidar.estimation import estimate_sensor
 from r2flow.lidar.matching import in_words
 from r2flow.lidar.sensors import SENSORS, Sensor, named_sensor
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 def reading_for(
@@ -87,14 +87,14 @@ def _detected(scans: Described, reading: Reading, estimate: bool) -> Sensor | st
         with suppress(InputError):
             points = readable(a_few(scans.paths), reading.columns)
             sensor = estimate_sensor([*points.values()], "estimated").sensor
-            log.warning(
+            _log.warning(
                 "%s: no built-in sensor fits; read by its own %s; --sensor names another",
                 scans.label,
                 in_words(sensor.elevations),
             )
             return sensor
     if name:
-        log.warning(
+        _log.warning(
             "%s: read as scans of %s, whose beams are nearest; --sensor names another",
             scans.label,
             name,

@@ -20,7 +20,7 @@ from r2flow.data.sources import ScanSource, spread
 from r2flow.lidar.labels import labels_beside
 from r2flow.store import checksum
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 Read = TypeVar("Read")
 
@@ -131,7 +131,7 @@ class ScanFiles(ScanSource):
                 return read(Path(self.paths[candidate]))
             except InputError as error:
                 self.bad.add(candidate)
-                log.warning("left out: %s", error)
+                _log.warning("left out: %s", error)
         raise InputError(
             f"all {len(self.paths)} scans were left out as unusable; see the warnings above."
         )

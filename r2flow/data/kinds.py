@@ -27,7 +27,7 @@ from r2flow.data.sources import ScanSource
 if TYPE_CHECKING:
     from r2flow.data.described import Described
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 HowRead = Reading | ReadingOptions
 
@@ -75,7 +75,7 @@ class SourceKind(ABC):
         return [drive for drive in drives if self.split_of(drive.name) == split]
 
 
-class Simulated(SourceKind):
+class _Simulated(SourceKind):
     """Street scenes of a seed."""
 
     def open(self, scans: "Described", reading: Reading) -> ScanSource:
@@ -120,7 +120,7 @@ class Layout(SourceKind):
 
     def open(self, scans: "Described", reading: Reading) -> ScanFiles:
         if reading.projection == "unfolding" and reading.sensor.name == "hdl64e":
-            log.warning(
+            _log.warning(
                 "unfolded rows are the sensor's rings, which are not evenly spaced: "
                 "sensor=hdl64e_rings has their elevations, sensor=hdl64e is up to 6 degrees off"
             )
@@ -143,7 +143,7 @@ class Layout(SourceKind):
             return lacks_reflectance(scans.paths, reading.on_bad_scan, reading.columns)
 
 
-class Prepared(SourceKind):
+class _Prepared(SourceKind):
     """Shards of `r2flow prepare`."""
 
     def open(self, scans: "Described", reading: Reading) -> ScanSource:
@@ -173,7 +173,7 @@ def _warn_of_parts(store: PreparedStore, kind: SourceKind) -> None:
     """Warn of prepared scans of several parts of the split, all of which are taken."""
     parts = {kind.split_of(drive.name) for drive in store.drives} - {None}
     if len(parts) > 1:
-        log.warning(
+        _log.warning(
             "%s holds %s drives, and data.split=null takes all of them",
             store.folder,
             " and ".join(sorted(map(str, parts))),
@@ -182,8 +182,8 @@ def _warn_of_parts(store: PreparedStore, kind: SourceKind) -> None:
 
 SOURCES: Registry[SourceKind] = Registry(
     "data set",
-    simulated=Simulated(levels=100),
-    prepared=Prepared(),
+    simulated=_Simulated(levels=100),
+    prepared=_Prepared(),
     kitti_360=Layout(layouts.kitti_360, splits=layouts.KITTI_360_SPLIT, levels=256),
     kitti_raw=Layout(layouts.kitti_raw, levels=100),
     odometry=Layout(layouts.odometry, splits=layouts.ODOMETRY_SPLIT, levels=100),

@@ -16,7 +16,7 @@ from r2flow.lidar.scan_files import (
 )
 from r2flow.store import MANIFEST, manifest_of
 
-Names = tuple[str, ...]  # paths of files, or endings of their names
+_Names = tuple[str, ...]  # paths of files, or endings of their names
 
 KITTI_360_SPLIT = {"train": (3, 4, 5, 6, 7, 9, 10), "test": (0, 2)}
 ODOMETRY_SPLIT = {
@@ -47,7 +47,7 @@ class Drive:
 
     name: str  # its name in `data.drives`
     # paths as strings: 100,000 Path objects take seconds and ten times the memory
-    scans: Names
+    scans: _Names
 
 
 def kitti_360(root: Path) -> list[Drive]:
@@ -165,7 +165,7 @@ def elsewhere(root: Path) -> str:
     return next((f" {path} {advice}." for path in paths if (advice := conversion_of(path))), "")
 
 
-def _one_of_each(paths: Names) -> Names:
+def _one_of_each(paths: _Names) -> _Names:
     images_last = sorted(paths, key=lambda path: path.lower().endswith(".npy"))
     kept = set({path[: len(path) - len(scan_ending(path))]: path for path in images_last}.values())
     return tuple(path for path in paths if path in kept)
@@ -199,12 +199,12 @@ def numbers(name: str) -> set[int]:
     return {int(digits)} if digits.isdecimal() else set()
 
 
-def _files(folder: Path, endings: Names) -> Names:
+def _files(folder: Path, endings: _Names) -> _Names:
     """The files of a folder with some endings, in order; none without such a folder."""
     return _scans(folder, os.listdir(folder), endings) if folder.is_dir() else ()
 
 
-def _scans(folder: Path, names: Iterable[str], endings: Names) -> Names:
+def _scans(folder: Path, names: Iterable[str], endings: _Names) -> _Names:
     """The files with some endings, in the order of the numbers in their names (2.bin before
     10.bin), without hidden files (macOS writes ._NAME next to NAME).
     """

@@ -20,7 +20,7 @@ from r2flow.lidar.sensors import Sensor
 
 Item = dict[str, Tensor]
 # of x_1, (C, H, W), its sensor, the image's draws
-Further = Callable[[Tensor, Sensor, np.random.Generator], Item]
+_Further = Callable[[Tensor, Sensor, np.random.Generator], Item]
 # of an item: the number k of the image in the run, and that of the scan; or both in one
 Key = int | tuple[int, int]
 
@@ -30,7 +30,7 @@ class ItemFormat(NamedTuple):
 
     encoding: Encoding  # of the scans
     noise_shape: tuple[int, ...]  # of x_0
-    further: Further | None = None  # makes further entries for training and validation
+    further: _Further | None = None  # makes further entries for training and validation
     several_sensors: bool = False  # whether parts of a mixture may be scans of different sensors
     smallest: tuple[int, int] = (1, 1)  # rows and columns that `further` needs
 

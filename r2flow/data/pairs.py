@@ -127,7 +127,7 @@ def make_pairs(store: PairStore, generator: Generator, wait: bool = True) -> lis
             # killed: this process would draw all pairs and then fail
             if launched and os.getppid() != launcher:
                 raise Stopped(LATER, "stopped: the process that launched this one has ended")
-            batches.append(solve_batch(store, flow, batch))
+            batches.append(_solve_batch(store, flow, batch))
             evaluations += int(batches[-1]["evaluations"].sum())
             usable.extend(batches[-1]["usable"].tolist())
             seconds = time.monotonic() - start
@@ -174,7 +174,7 @@ def _drawer(store: PairStore, generator: Generator) -> Flow:
     return flow
 
 
-def solve_batch(store: PairStore, generator: Flow, batch: int) -> dict[str, np.ndarray]:
+def _solve_batch(store: PairStore, generator: Flow, batch: int) -> dict[str, np.ndarray]:
     """The pairs first + [b B, (b + 1) B) of batch b: x_1, evaluations and usable.
 
     x_1 is float16, (B, C, H, W); pairs that overflow float16 are not usable.

@@ -20,9 +20,9 @@ from r2flow.lidar.other_sensors import Partial, image_through
 from r2flow.lidar.scan_files import Points, points_beside, points_of, read_cloud, scan_ending
 from r2flow.lidar.sensors import Sensor
 
-FEW = 4  # default number of simulated scans
+_FEW = 4  # default number of simulated scans
 
-Opened = tuple[list["PartialScan"], list[str]]  # scans, and lines about their sensors
+_Opened = tuple[list["PartialScan"], list[str]]  # scans, and lines about their sensors
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def open_partial(
     source: Sensor | None = None,
     scale: float | None = None,
     most: int | None = None,
-) -> Opened:
+) -> _Opened:
     """Open the scans of some names (`describe`). Scans are read on demand, except a few to
     determine their sensor.
 
@@ -60,10 +60,10 @@ def open_partial(
     Args:
         reading: How the model's training scans became images.
         scale: The value in scan files that means full reflectance; None: the default.
-        most: Maximum number of scans per name, evenly spread; None: all scans, or `FEW` simulated
+        most: Maximum number of scans per name, evenly spread; None: all scans, or `_FEW` simulated
             scans.
     """
-    opened: list[Opened] = []
+    opened: list[_Opened] = []
     files: dict[Path, list[Described]] = {}  # by their folder
     for scans in map(describe, specs):
         if scans.options.name in (SIMULATED, PREPARED):
@@ -89,7 +89,7 @@ def _files(
     reading: Reading,
     source: Sensor | None,
     scale: float | None,
-) -> Opened:
+) -> _Opened:
     target = reading.sensor
     stored = described.stored
     folder = described.options.folder
@@ -101,7 +101,7 @@ def _files(
     see: Sight | None = None
     images = {path for path in paths if path.suffix.lower() == ".npy" and is_image(path)}
     if points := [path for path in paths if path not in images]:
-        scans = {path: measured_points(path, reading.columns) for path in a_few(points)}
+        scans = {path: _measured_points(path, reading.columns) for path in a_few(points)}
         again = any(scan.cloud and scan.cloud.place("measured") for scan in scans.values())
         seen = sight(described, scans, reading, source if again else sensor, scale)
         see = seen.see
@@ -115,7 +115,7 @@ def _files(
     def read(path: Path) -> Partial:
         if see is None or path in images:
             return read_partial(path, sensor, target, ids)
-        return see(path, measured_points(path, reading.columns))
+        return see(path, _measured_points(path, reading.columns))
 
     def opened(path: Path) -> PartialScan:
         ending = scan_ending(path.name) or path.suffix
@@ -127,7 +127,7 @@ def _files(
     return [opened(path) for path in paths], lines
 
 
-def measured_points(path: Path, columns: Sequence[str] | None) -> Points:
+def _measured_points(path: Path, columns: Sequence[str] | None) -> Points:
     """The points of a file that a sensor measured, with all their fields."""
     cloud = read_cloud(path, columns)
     measured = cloud.measured()
@@ -138,13 +138,13 @@ def measured_points(path: Path, columns: Sequence[str] | None) -> Points:
 
 def _images(
     described: Described, reading: Reading, source: Sensor | None, most: int | None
-) -> Opened:
+) -> _Opened:
     """Simulated and prepared scans, named by their number in the whole set."""
     target = reading.sensor
     label = described.label
     simulated = described.stored is None
     stored = described.stored or replace(reading, sensor=source or target)
-    scans = open_scans(described, stored, num=(most or FEW) if simulated else None).source
+    scans = open_scans(described, stored, num=(most or _FEW) if simulated else None).source
     kind = label.replace(":", "-") if simulated else Path(label).name
 
     def opened(number: int) -> PartialScan:

@@ -23,9 +23,9 @@ from r2flow.data.sensor_checks import warn_of_other_sensor
 from r2flow.data.sources import spread
 from r2flow.store import checksum
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
-PROJECTION = 4  # revision; increase it when the same files give different images or codes
+_PROJECTION = 4  # revision; increase it when the same files give different images or codes
 
 
 def plan(
@@ -46,7 +46,7 @@ def plan(
     reading = replace(reading, reflectance=levels is not None, labels=labelled(scans.paths) > 0)
     names = [name for drive in drives for name in drive.scans]
     recipe = {
-        "revision": PROJECTION, "layout": scans.options.name, "scans": len(names),
+        "revision": _PROJECTION, "layout": scans.options.name, "scans": len(names),
         "names": checksum(names), "reading": reading.described(), "levels": levels,
         "shard_scans": shard_scans,
     }  # fmt: skip
@@ -74,7 +74,7 @@ def _make_shard(store: PreparedStore, skip: bool, shard: int) -> None:
         except InputError as error:
             if not skip:
                 raise
-            log.warning("left out: %s", error)
+            _log.warning("left out: %s", error)
             left_out.append(number)
     shape = len(images), len(store.codes), *store.reading.sensor.shape
     channels = np.reshape(images, shape).swapaxes(0, 1)

@@ -30,7 +30,7 @@ from r2flow.lidar.scan_files import (
 )
 from r2flow.lidar.sensors import Sensor
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 AUTO = "auto"
 
@@ -81,7 +81,7 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Projected:
+class _Projected:
     """The points of a file as an image, (2 or 1, H, W)."""
 
     image: np.ndarray
@@ -90,7 +90,7 @@ class Projected:
     numbers: np.ndarray  # of the points of these pixels, (M,)
 
 
-def project_file(path: str | Path, reading: Reading) -> Projected:
+def _project_file(path: str | Path, reading: Reading) -> _Projected:
     """Read a file of points as an image."""
     try:
         return _projected(path, reading)
@@ -99,10 +99,10 @@ def project_file(path: str | Path, reading: Reading) -> Projected:
             raise
     shape = (1 + bool(reading.reflectance), *reading.sensor.shape)
     none = np.zeros(0, np.int64)
-    return Projected(np.zeros(shape, np.float32), Points(np.zeros((0, 3), np.float32)), none, none)
+    return _Projected(np.zeros(shape, np.float32), Points(np.zeros((0, 3), np.float32)), none, none)
 
 
-def _projected(path: str | Path, reading: Reading) -> Projected:
+def _projected(path: str | Path, reading: Reading) -> _Projected:
     sensor = reading.sensor
     points = read_points(path, reading.columns)
     if reading.projection == "unfolding":
@@ -117,7 +117,7 @@ def _projected(path: str | Path, reading: Reading) -> Projected:
     if not r.any():
         raise nothing_in_view(path, points, sensor)
     image = scatter(sensor, pixels, [r, *(channel[numbers] for channel in scaled)])
-    return Projected(image, points, pixels, numbers)
+    return _Projected(image, points, pixels, numbers)
 
 
 def nothing_in_view(path: str | Path, points: Points, sensor: Sensor) -> NoPointsError:
@@ -146,7 +146,7 @@ def read_image(path: Path, reading: Reading) -> np.ndarray:
         image, ids = read_labelled_scan(path, file, reading, reading.label_ids)
         return np.concatenate([image, common_classes(ids)[None]])
     else:
-        image = project_file(path, reading).image
+        image = _project_file(path, reading).image
     return np.concatenate([image, np.zeros_like(image[:1])]) if reading.labels else image
 
 
@@ -156,7 +156,7 @@ def read_labelled_scan(
     """The image of a scan, and from its label file each pixel's semantic id, (H, W) uint16, 0 for
     no return; `ids` as in `read_labels`.
     """
-    projected = project_file(path, reading)
+    projected = _project_file(path, reading)
     labels = read_labels(file, path, projected.points, ids)[projected.numbers]
     semantic = scatter(reading.sensor, projected.pixels, [labels])[0]
     return projected.image, semantic.astype(np.uint16)
@@ -200,7 +200,7 @@ def read_points_image(path: Path, reading: Reading) -> tuple[np.ndarray, np.ndar
     """Read points as an image, (2 or 1, H, W), and its pixels' points in metres, (3, H, W) float32,
     0 for no return.
     """
-    projected = project_file(path, reading)
+    projected = _project_file(path, reading)
     xyz = projected.points.xyz[projected.numbers]
     return projected.image, scatter(reading.sensor, projected.pixels, xyz.T)
 
@@ -214,7 +214,7 @@ def labelled(paths: Sequence[str]) -> int:
             missing.append(path)
     number = len(paths) - len(missing)
     if number and missing:
-        log.warning(
+        _log.warning(
             "%d of %d scans have labels; the first without: %s", number, len(paths), missing[0]
         )
     return number

@@ -9,8 +9,8 @@ from r2flow.base.errors import InputError, warn_odd
 from r2flow.lidar.estimation import FULL_REFLECTANCE, OUTLIERS, SURE, full_reflectance
 from r2flow.lidar.scan_files import NoPointsError, Points, read_points, read_range_image
 
-FAINT = 0.1  # of full reflectance: below it the scale is probably wrong
-DARKEST = 0.01  # likewise of the median; that of bytes is 0.03 or more
+_FAINT = 0.1  # of full reflectance: below it the scale is probably wrong
+_DARKEST = 0.01  # likewise of the median; that of bytes is 0.03 or more
 DIVIDED = (
     "reflectance is divided by %g; --reflectance-scale (of r2flow.read reflectance_scale) "
     "names another value"
@@ -43,7 +43,7 @@ def estimated_scale(path: str | Path, scans: Iterable[Points]) -> float:
 
 def is_dark(reflectance: np.ndarray, scale: float) -> bool:
     """Whether values above 0 are so far below full reflectance that it is probably another one."""
-    return bool(reflectance.max() < FAINT * scale or np.median(reflectance) < DARKEST * scale)
+    return bool(reflectance.max() < _FAINT * scale or np.median(reflectance) < _DARKEST * scale)
 
 
 def scaled_reflectance(

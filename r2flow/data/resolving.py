@@ -24,7 +24,7 @@ from r2flow.lidar.sensors import Sensor, build_sensor, sensor_options
 Source = TypeVar("Source", bound=SourceOptions)
 
 # Options that a kind of scans would ignore.
-IGNORED = {
+_IGNORED = {
     SIMULATED: ("root", "split", "drives"),
     PAIRS: ("split", "drives"),
     MIXED: ("split", "drives"),
@@ -151,7 +151,7 @@ def _checked_set(what: str, kind: type[Source], options: Options) -> Source:
 
 
 def _refuse_ignored(what: str, options: SourceOptions) -> None:
-    for key in IGNORED.get(options.name, ()):
+    for key in _IGNORED.get(options.name, ()):
         if getattr(options, key) is not None:
             raise InputError(f"{what}.{key} does nothing for {options.name} scans: leave it out.")
 

@@ -14,9 +14,9 @@ from r2flow.data.sources import InMemory, ScanSource, holdout_block, spread
 from r2flow.lidar.encoding import Encoding
 from r2flow.lidar.sensors import Sensor
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
-Opened = tuple[Mixture, Mixture, list[str]]
+_Opened = tuple[Mixture, Mixture, list[str]]
 Scans = Mixture | np.ndarray  # scans, or the numbers of pairs
 
 
@@ -36,7 +36,7 @@ def open_for_training(
     return scans.open(Reading.of(reading))
 
 
-def open_plan(plan: DataPlan, encoding: Encoding, validation: ValidationOptions) -> Opened:
+def open_plan(plan: DataPlan, encoding: Encoding, validation: ValidationOptions) -> _Opened:
     """The training scans, the held-out ones, and the names of all training sets.
 
     Without `validation.data`, each part of a mixture holds out one block.
@@ -70,7 +70,7 @@ def _warn_of_shared(training: Sequence[ScanSource], held: Sequence[ScanSource]) 
     trained = set[str]().union(*(source.places() for source in training))
     validated = set[str]().union(*(source.places() for source in held))
     if shared := trained & validated:
-        log.warning(
+        _log.warning(
             "%d held-out scans are trained on, as %s: give each set its own split or drives",
             len(shared),
             min(shared),

@@ -26,8 +26,8 @@ from r2flow.lidar.scan_files import Points
 from r2flow.lidar.sensors import SENSORS, Sensor
 
 # with less than this share of rays per column, pixels between the rays are not measured
-FEWER = 0.9
-THROUGH = "in Python Checkpoint.through of such a sensor, uses them with densify"
+_FEWER = 0.9
+_THROUGH = "in Python Checkpoint.through of such a sensor, uses them with densify"
 
 Sight = Callable[[Path, Points], Partial]  # the image of the points of a scan of this name
 
@@ -51,7 +51,7 @@ class _Scale:
     strict: bool  # whether values beyond are refused, not clipped
 
     def of(self, points: Points) -> float:
-        return self.full or own_scale(points, self.of_sensor)
+        return self.full or _own_scale(points, self.of_sensor)
 
 
 def sight(
@@ -65,7 +65,7 @@ def sight(
     """How scans of one sensor are seen as images of the model's.
 
     It is found from a few scans, by path. For `source` and `scale` see `open_partial`. With `each`,
-    the scale of reflectance is found for every scan by itself (`own_scale`).
+    the scale of reflectance is found for every scan by itself (`_own_scale`).
     """
     path = next(iter(scans))
     points = [*scans.values()]
@@ -96,7 +96,7 @@ def sight(
         warn_odd(path, f"sensor {source.name} does not fit these scans: {doubt.seen}{fits}")
     of_sensor = known.reflectance_scale if known else None
     full = _scale_of(described, scans, of_sensor, scale, each)
-    if same and fired.columns >= FEWER * target.columns:
+    if same and fired.columns >= _FEWER * target.columns:
         see = partial(_seen, reading=reading, fired=None, scale=full)
         return Seeing(see, [], None, full.full)
     see = partial(_seen, reading=reading, fired=fired, scale=full)
@@ -121,7 +121,7 @@ def _scale_of(
     default = described.scale(of_sensor) if described.options.name != FOLDER or of_sensor else 0.0
     written = described.written_scale if described.stored else None
     if each:
-        full = own_scale(points[0], of_sensor)
+        full = _own_scale(points[0], of_sensor)
     else:
         full = written or full_reflectance(points, default) or default or 1.0
     if not described.stored and full != default and (of_sensor or full not in SURE):
@@ -129,7 +129,7 @@ def _scale_of(
     return _Scale(None if each else full, of_sensor, full in FULL_REFLECTANCE and not each)
 
 
-def own_scale(points: Points, default: float | None = None) -> float:
+def _own_scale(points: Points, default: float | None = None) -> float:
     """The value of full reflectance of a scan, from its own values alone, so that scans of a stream
     have the same scale whatever came before: `full_reflectance`, but bytes are of 255, since a
     later scan of the same sensor may exceed 100.
@@ -164,7 +164,7 @@ def lines_about(label: str, source: Sensor, target: Sensor, turns: bool = False)
         )
     measured = f"{len(set(rows[seen]))} of the {target.shape[0]} rows to complete are measured"
     turn = ""
-    if turns and source.columns < FEWER * target.columns:
+    if turns and source.columns < _FEWER * target.columns:
         turn = f", in the columns that its {source.columns} rays a turn meet"
     lines = [f"{label}: {beams}; {measured}{turn}"]
     if not seen.all():
@@ -174,7 +174,7 @@ def lines_about(label: str, source: Sensor, target: Sensor, turns: bool = False)
         lines.append(
             f"{label}: {(~seen).sum()} of its {len(e)} beams look past the view of {target.name} "
             f"and are not used: --to {name} --size {max(target.shape[0], len(e))}x{columns}, "
-            f"{THROUGH}"
+            f"{_THROUGH}"
         )
     return lines
 

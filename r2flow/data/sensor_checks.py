@@ -20,17 +20,17 @@ from r2flow.store import MANIFEST
 if TYPE_CHECKING:
     from r2flow.data.described import Described
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
-File = TypeVar("File", str, Path)
+_File = TypeVar("_File", str, Path)
 
 
-def a_few(paths: Sequence[File]) -> list[File]:
+def a_few(paths: Sequence[_File]) -> list[_File]:
     """At most three of some files, evenly spread, whose beams are looked at."""
     return [paths[number] for number in spread(len(paths), 3)]
 
 
-def readable(paths: Sequence[File], columns: Sequence[str] | None) -> dict[File, Points]:
+def readable(paths: Sequence[_File], columns: Sequence[str] | None) -> dict[_File, Points]:
     """The points of the files that hold points, by path; others are reported when they are read as
     scans.
     """
@@ -126,7 +126,7 @@ def warn_of_other_sensor(scans: "Described", reading: Reading) -> None:
     elif not mismatch.hopeless:
         estimate = f"r2flow sensor {shlex.quote(str(place))} --out mine.yaml"
         advice = f"; give the right one, or estimate it: {estimate}"
-    log.warning(
+    _log.warning(
         "%s: read as scans of sensor '%s', which sees %+.1f to %+.1f degrees, but %s%s",
         place, sensor.name, *sensor.row_edges[[0, -1]], mismatch.seen, advice,
     )  # fmt: skip

@@ -15,7 +15,7 @@ from r2flow.lidar.labels import common_classes
 from r2flow.lidar.sensors import Sensor
 from r2flow.store import Damaged, Store, checksum
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 WORTH_KEEPING = 32  # simulated scans: fewer are simulated again
 
@@ -64,7 +64,7 @@ class SimulatedScans(MadeScans):
             images = super().read_all(what, shape)
         with suppress(OSError):  # a full disk, a home that is read-only
             store.write(0, {"images": images})
-            log.info("the simulated scans are kept in %s (%.0f MB)", folder, images.nbytes / 1e6)
+            _log.info("the simulated scans are kept in %s (%.0f MB)", folder, images.nbytes / 1e6)
         return images
 
     @property

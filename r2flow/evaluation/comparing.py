@@ -17,8 +17,8 @@ from r2flow.evaluation.sets import baseline_sets, reference_sets
 from r2flow.metrics.panel import LACKING, PANEL, REFLECTANCE, mean_distance
 from r2flow.store import checksum
 
-Kind = Literal["judged", "reference", "baseline"]
-Pair = tuple[Kind, str, ScanSet, ScanSet]  # kind, name, real scans, scans compared with them
+_Kind = Literal["judged", "reference", "baseline"]
+_Pair = tuple[_Kind, str, ScanSet, ScanSet]  # kind, name, real scans, scans compared with them
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Comparison:
     real: ScanSet
     generated: ScanSet
     measured: Sequence[MetricResult]
-    kind: Kind = "judged"
+    kind: _Kind = "judged"
 
     @property
     def title(self) -> str:
@@ -44,12 +44,12 @@ def pairs_of(
     judged: Mapping[str, ScanSet],
     reference: bool | None = None,
     baselines: bool | None = None,
-) -> list[Pair]:
+) -> list[_Pair]:
     """The judged sets against the real one, with references and baselines.
 
     By default (None) these are there if any set is judged.
     """
-    pairs: list[Pair] = [("judged", name, real, scans) for name, scans in judged.items()]
+    pairs: list[_Pair] = [("judged", name, real, scans) for name, scans in judged.items()]
     if reference or (judged and reference is None and len(real) > 1):
         for name, sets in reference_sets(real, judged).items():
             pairs.append(("reference", name, *sets))
@@ -91,7 +91,7 @@ class Comparer(Measurer):
     folder: Path | None = None
     _statistics: dict[ScanSet, dict[str, Statistics]] = field(default_factory=dict)
 
-    def __call__(self, kind: Kind, name: str, real: ScanSet, other: ScanSet) -> Comparison:
+    def __call__(self, kind: _Kind, name: str, real: ScanSet, other: ScanSet) -> Comparison:
         """Compare two sets, or read the stored results."""
         path = self._stored(real, other)
         if path is not None:

@@ -28,9 +28,9 @@ from r2flow.lidar.encoding import Encoding
 from r2flow.metrics.base import Protocol
 from r2flow.metrics.scans import Scans
 
-CELLS = (16, 128)  # maximum rows and columns of cells
-SAME = 5e-3  # largest distance of equal scans, whose files may be rounded; other frames have 0.1
-PAIRS = {"cpu": 1024, "cuda": 131072}  # pairs per block, by device: sized for the CPU's cache
+_CELLS = (16, 128)  # maximum rows and columns of cells
+_SAME = 5e-3  # largest distance of equal scans, whose files may be rounded; other frames have 0.1
+_PAIRS = {"cpu": 1024, "cuda": 131072}  # pairs per block, by device: sized for the CPU's cache
 
 
 def _described(
@@ -40,7 +40,7 @@ def _described(
 
     NaN for a scan without returns.
     """
-    cells = np.minimum(CELLS, scans.sensor.shape).tolist()
+    cells = np.minimum(_CELLS, scans.sensor.shape).tolist()
     encoding = Encoding(training.sensor, reflectance=False)  # a model's limits may be others
     with torch.no_grad(), bar(doing, len(scans)) as advance:
         for images in scans.batches(range(len(scans)), work.batch_size, work.workers):
@@ -76,7 +76,7 @@ class _Nearest:
         energy = both.square().sum((1, 2)).nan_to_num(torch.inf)
         spectra = torch.fft.rfft(both.nan_to_num(0.0)).permute(2, 1, 0).contiguous()  # (K, h, 2 M)
         columns = torch.arange(width, device=y.device)
-        block = max(PAIRS.get(y.device.type, 1024) // len(y), 1)
+        block = max(_PAIRS.get(y.device.type, 1024) // len(y), 1)
         for start in range(0, len(self._x), block):
             at = slice(start, start + block)
             # -2 c(u), (w, n, 2 M)
@@ -116,7 +116,7 @@ def _copies_result(judged: _Nearest, real: _Nearest) -> MetricResult:
     one-sided Mann-Whitney U does not prove copying: scans that resemble training streets are nearer
     without being copies, and frames of one drive are not independent.
     """
-    others = real.distances[real.distances >= SAME]
+    others = real.distances[real.distances >= _SAME]
     same = len(real.distances) - len(others)
     d = others if judged is real and len(others) else judged.distances
     figures = {"copies": float(np.median(d))}
@@ -134,7 +134,7 @@ def _copies_result(judged: _Nearest, real: _Nearest) -> MetricResult:
             f"nearer in {nearer:.0%} of all pairs (p = {test.pvalue:.2g})."
         )
     settings = {
-        "cells": list(CELLS),
+        "cells": list(_CELLS),
         "turned": True,
         "mirrored": True,
         "training scans": len(real.training),

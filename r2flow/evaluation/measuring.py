@@ -24,14 +24,14 @@ from r2flow.metrics.base import Protocol, ScanMetric
 from r2flow.metrics.scans import Scans
 from r2flow.store import Damaged, Store, checksum
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 FORMAT = 12  # increment if statistics or figures change for the same scans and protocol
 # Metrics of single-scan histograms use this many real scans, by a fixed shuffle; metrics of
 # features use all.
 REAL_SCANS = 10_000
 
-Metrics = Mapping[str, ScanMetric]  # by name
+_Metrics = Mapping[str, ScanMetric]  # by name
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Cache:
         try:
             self._store(key).write(0, states, notes)
         except OSError as error:
-            log.warning("statistics are not cached: %s: %s", self.folder, error.strerror or error)
+            _log.warning("statistics are not cached: %s: %s", self.folder, error.strerror or error)
 
 
 def key_of(metric: ScanMetric, scans: ScanSet, choice: str) -> str:
@@ -121,7 +121,7 @@ def _of_all_processes(count: int) -> int:
 class Measurer:
     """Compares sets of scans by some metrics, under the rules of a protocol."""
 
-    metrics: Metrics
+    metrics: _Metrics
     work: Work = Work()
     rules: Rules = R2FLOW
     cache: Cache | None = None  # of the statistics of real scans

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from r2flow.base.registry import Registry
 
-Loss = Callable[[Tensor, Tensor], Tensor]
+_Loss = Callable[[Tensor, Tensor], Tensor]
 
 _C = 0.00054  # c = 0.00054 sqrt(d), paper, below eq. 3
 
@@ -46,7 +46,7 @@ def absolute(v_t: Tensor, u_t: Tensor) -> Tensor:
     return (v_t.float() - u_t.float()).abs().flatten(1).mean(1)
 
 
-LOSSES: Registry[Loss] = Registry(
+LOSSES: Registry[_Loss] = Registry(
     "loss",
     mse=mse,
     pseudo_huber=pseudo_huber,

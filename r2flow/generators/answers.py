@@ -14,10 +14,10 @@ from r2flow.generators.calibration import Calibration
 NEVER = -1e4  # logit of a missing candidate
 # Correlation length of drawn answers: best panel on scans of KITTI raw and object.
 TOGETHER = math.radians(1.5)
-HIT = 0.1  # metres
+_HIT = 0.1  # metres
 # Widths of an interval about a completed range, over its expected error, between which
 # probabilities are interpolated: on scans they are then wrong by 1 % in the mean.
-WIDTHS = (1 / 32, 1 / 8, 1 / 3, 1.0, 2.5)
+_WIDTHS = (1 / 32, 1 / 8, 1 / 3, 1.0, 2.5)
 _WIDEST = 5.0  # largest width: nothing is known of such a ray
 RAYS = 8192  # of a block: what is computed of them stays in a core's cache
 FAINT = 0.1  # reflectance of training, below which differences are as errors, not as ratios
@@ -83,8 +83,8 @@ class Answers:
         return mean.exp() - self.faint
 
     def hits(self, log_r: Tensor) -> Tensor:
-        """Probability, given a return, that r is within `HIT` of a range, (B, 1, H, W)."""
-        return (2 * HIT * (self.log_density(log_r) - log_r).exp()).clamp(max=1)
+        """Probability, given a return, that r is within `_HIT` of a range, (B, 1, H, W)."""
+        return (2 * _HIT * (self.log_density(log_r) - log_r).exp()).clamp(max=1)
 
     def likeliest(self, log_r: Tensor) -> Tensor:
         """Index of the candidate most likely to have produced log r, (B, 1, H, W)."""
@@ -141,7 +141,7 @@ class Answers:
         """Metres e with P(|x - r| <= e | return) = level for ranges r, (levels, B, H, W).
 
         r is (B, 1, H, W); 0 where r is 0 and for measured rays. Rays are independent of each other:
-        e is the half width of the interval log r +- w, of which P is known at some w (`WIDTHS`) and
+        e is the half width of the interval log r +- w, of which P is known at some w (`_WIDTHS`),
         interpolated linearly in log w and log(-log(1 - P)), which is exact for one Laplace density.
         """
         asked = ((r > 0) & (self.returns.abs() < -NEVER / 2)).flatten().nonzero()[:, 0]
@@ -185,7 +185,7 @@ def _widths(p: Tensor, away: Tensor, scales: Tensor, wanted: Sequence[float]) ->
     inverse = 1 / scales
     mean = (p * (away + scales * (-away * inverse).exp())).sum(0)
     y = []
-    for factor in WIDTHS:
+    for factor in _WIDTHS:
         width = factor * mean
         z = (width - away) * inverse
         near = z.abs().neg().exp()
@@ -193,7 +193,7 @@ def _widths(p: Tensor, away: Tensor, scales: Tensor, wanted: Sequence[float]) ->
         inside = (p * twice).sum(0) / 2
         y.append((-torch.log1p(-inside.clamp(1e-6, 1 - 1e-6))).log())
     found = []
-    x = [math.log(factor) for factor in WIDTHS]
+    x = [math.log(factor) for factor in _WIDTHS]
     for level in wanted:
         log_w = torch.full_like(mean, -torch.inf)
         for k in range(len(x) - 1):

@@ -14,7 +14,7 @@ from torch import Tensor
 from r2flow.base.errors import check
 from r2flow.base.files import parse_yaml, reading, write_file
 
-FEATURES = 3  # 1, log of the spread, log r
+_FEATURES = 3  # 1, log of the spread, log r
 _NEAR = 1e-3  # spread in log r at which the features end, and 1
 # Weights of `mixture` from which a fit begins.
 _FIRST = ((0.0, 0, 0), (-4.0, 0, 0), (-4.0, 0, 0), (1.0, 0, 0), (0.0, 0, 0))
@@ -66,7 +66,7 @@ class Calibration:
             values: Any = parse_yaml(path.read_text(encoding="utf-8"))
             spread = tuple(tuple(map(float, row)) for row in values["spread"])
             sizes = [len(row) for row in spread]
-            check(sizes == [FEATURES] * len(_FIRST), f"{path}: spread is (5, 3), found {sizes}.")
+            check(sizes == [_FEATURES] * len(_FIRST), f"{path}: spread is (5, 3), found {sizes}.")
             a, b = map(float, values["returns"])
             return cls(spread, (a, b))
 

@@ -14,17 +14,17 @@ from r2flow.lidar.scan_files import Cloud
 from r2flow.lidar.scan_files.cloud import as_type
 from r2flow.lidar.sensors import Sensor
 
-MEASURED = "measured"  # uint8: 1 for a point of the scan, 0 for an added one
-TRUST = ("error_68", "error_95", "p_return")  # float32, see `Completed.trust`
+_MEASURED = "measured"  # uint8: 1 for a point of the scan, 0 for an added one
+_TRUST = ("error_68", "error_95", "p_return")  # float32, see `Completed.trust`
 ROW = "image_row"  # uint16: row of the answer's sensor from the top, of every point
-NO_ROW = 65535  # of a measured point outside the view of the answer's sensor
+_NO_ROW = 65535  # of a measured point outside the view of the answer's sensor
 
 # By name: the value of each ray, (H, W), for added points, and that of all measured points.
-OfRays = Mapping[str, tuple[ndarray, float]]
+_OfRays = Mapping[str, tuple[ndarray, float]]
 
 
 def completed_cloud(
-    scan: Partial, image: ndarray, sensor: Sensor, of_rays: OfRays | None = None
+    scan: Partial, image: ndarray, sensor: Sensor, of_rays: _OfRays | None = None
 ) -> Cloud:
     """The measured points of a scan, unchanged and in their order, and then the added points.
 
@@ -76,8 +76,8 @@ def completed_cloud(
     )
     measured = len(cloud)
     more: dict[str, ndarray] = {
-        MEASURED: np.repeat(np.array([1, 0], np.uint8), [measured, len(xyz)]),
-        ROW: np.concatenate([np.where(scan.row < 0, NO_ROW, scan.row), row]).astype(np.uint16),
+        _MEASURED: np.repeat(np.array([1, 0], np.uint8), [measured, len(xyz)]),
+        ROW: np.concatenate([np.where(scan.row < 0, _NO_ROW, scan.row), row]).astype(np.uint16),
     }
     for (name, (_, of_measured)), of_added in zip(of_rays.items(), trust, strict=True):
         more[name] = np.concatenate([np.full(measured, of_measured, np.float32), of_added])
@@ -103,7 +103,7 @@ def unknown_fields(cloud: Cloud) -> list[str]:
     return [
         name
         for place, name in enumerate(cloud.names)
-        if place not in known and name not in (MEASURED, ROW, *TRUST)
+        if place not in known and name not in (_MEASURED, ROW, *_TRUST)
     ]
 
 

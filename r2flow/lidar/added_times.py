@@ -7,9 +7,9 @@ from numpy import ndarray
 
 from r2flow.base.errors import InputError
 
-TURN = 2 * pi
-CYCLE = 4  # rows after which an Ouster's beams look the same way again
-MOST_ODD = 0.1  # share of points whose times may contradict the turning, by an eighth of a turn
+_TURN = 2 * pi
+_CYCLE = 4  # rows after which an Ouster's beams look the same way again
+_MOST_ODD = 0.1  # share of points whose times may contradict the turning, by an eighth of a turn
 
 
 def times_of(
@@ -59,14 +59,14 @@ def times_of(
     head = since / rate
     ahead = _ahead(azimuth - head, row, rows)
     angle = azimuth - ahead[row]
-    if np.mean(np.cos(angle - head) < np.cos(pi / 4)) > MOST_ODD:
+    if np.mean(np.cos(angle - head) < np.cos(pi / 4)) > _MOST_ODD:
         raise InputError(
             f"its field {name} does not follow the azimuth in its rows: times run backwards or "
             f"jump.{cure}"
         )
     asked = asked_azimuth - ahead[asked_row]
     near = _nearest(row, angle, asked_row, asked)
-    turned = (asked - angle[near] + pi) % TURN - pi
+    turned = (asked - angle[near] + pi) % _TURN - pi
     found = (since[near] + rate * turned).clip(0, last - first)
     if time.dtype.kind == "f":
         return np.minimum(float(first) + found, float(last)).astype(time.dtype)
@@ -77,7 +77,7 @@ def _rate(time: ndarray, row: ndarray, azimuth: ndarray) -> float:
     """Time per radian, negative for a clockwise turn: the median of points a sixth of a row apart;
     0 without such points.
     """
-    azimuth = azimuth % TURN
+    azimuth = azimuth % _TURN
     order = np.lexsort((azimuth, row))
     step = len(row) // (6 * max(len(np.unique(row)), 1)) + 1
     turned = azimuth[order][step:] - azimuth[order][:-step]
@@ -90,19 +90,19 @@ def _ahead(angle: ndarray, row: ndarray, rows: int) -> ndarray:
     """How far each row looks ahead of the head in radians, (H,), by the mean of its points.
 
     That of a row without points lies between those of its neighbours; of an Ouster, each of
-    `CYCLE` rows looks further than the one before it, by equal steps.
+    `_CYCLE` rows looks further than the one before it, by equal steps.
     """
     known, place = np.unique(row, return_inverse=True)
     look = np.exp(1j * angle)
     mean = look.sum()
     turned = look / mean
     ahead = np.angle(np.bincount(place, turned.real) + 1j * np.bincount(place, turned.imag))
-    phase = known % CYCLE
+    phase = known % _CYCLE
     cycle = np.zeros(rows)
     if np.ptp(phase):
         step, first = np.polyfit(phase, ahead, 1)
         if np.median(abs(ahead - first - step * phase)) < abs(step) / 10:
-            cycle = step * (np.arange(rows) % CYCLE)
+            cycle = step * (np.arange(rows) % _CYCLE)
     return np.angle(mean) + cycle + np.interp(np.arange(rows), known, ahead - cycle[known])
 
 
@@ -112,11 +112,11 @@ def _nearest(row: ndarray, angle: ndarray, asked_row: ndarray, asked: ndarray) -
     rows = np.arange(asked_row.max(initial=0) + 1)
     instead = known[abs(rows[:, None] - known).argmin(axis=1)]
     # Every row takes three turns: its points, and the same a turn before and after.
-    key = 3 * TURN * row + angle % TURN
-    keys = np.concatenate([key - TURN, key, key + TURN])
+    key = 3 * _TURN * row + angle % _TURN
+    keys = np.concatenate([key - _TURN, key, key + _TURN])
     order = np.argsort(keys)
     keys = keys[order]
-    wanted = 3 * TURN * instead[asked_row] + asked % TURN
+    wanted = 3 * _TURN * instead[asked_row] + asked % _TURN
     after = np.searchsorted(keys, wanted)
     before_is_nearer = wanted - keys[after - 1] < keys[after] - wanted
     return order[after - before_is_nearer] % len(row)

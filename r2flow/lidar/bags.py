@@ -15,8 +15,8 @@ from r2flow.base.errors import InputError, check, require
 from r2flow.base.files import reading_errors
 from r2flow.lidar.point_cloud2 import CLOUD, ENCODINGS, Scan, read_message
 
-ENDINGS = (".mcap", ".db3", ".bag")
-LARGEST_MESSAGE = 1 << 28  # bytes unpacked; a cloud of 128 x 4096 points has 25 MB
+_ENDINGS = (".mcap", ".db3", ".bag")
+_LARGEST_MESSAGE = 1 << 28  # bytes unpacked; a cloud of 128 x 4096 points has 25 MB
 _OTHER_CLOUDS = (  # how they become scans
     "Compressed clouds: ros2 run point_cloud_transport republish. Others: read them by the Python "
     "package mcap-protobuf-support, mcap-ros2-support, mcap-ros1-support or mcap, and write x, y, "
@@ -72,7 +72,7 @@ class Recording:
 def is_recording(path: str | Path) -> bool:
     """Whether a path names a recording: a file, or the folder of a ROS 2 bag."""
     path = Path(path)
-    return path.suffix.lower() in ENDINGS or _files(path) != [path]
+    return path.suffix.lower() in _ENDINGS or _files(path) != [path]
 
 
 @contextmanager
@@ -131,11 +131,11 @@ def _unpacked(message: Message) -> Message:
 
     size = zstandard.frame_content_size(message.data)
     check(
-        size <= LARGEST_MESSAGE,
-        f"it has a message of {size:,} bytes, more than {LARGEST_MESSAGE >> 20} MiB.",
+        size <= _LARGEST_MESSAGE,
+        f"it has a message of {size:,} bytes, more than {_LARGEST_MESSAGE >> 20} MiB.",
     )
     decompressor = zstandard.ZstdDecompressor()
-    return message._replace(data=decompressor.decompress(message.data, LARGEST_MESSAGE))
+    return message._replace(data=decompressor.decompress(message.data, _LARGEST_MESSAGE))
 
 
 def _files(path: Path) -> list[Path]:

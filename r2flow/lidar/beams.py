@@ -22,19 +22,19 @@ from r2flow.lidar.unfolding import (
     scatter_of,
 )
 
-BANDWIDTHS = np.geomspace(0.015, 2.0, 50)  # degrees
-BIN = 0.005  # degrees
-FAINT = 0.02  # share of the median peak's height below which a peak is not a beam
-SAME = 0.02  # degrees: neighbouring lasers that are nearer are two returns of one
+_BANDWIDTHS = np.geomspace(0.015, 2.0, 50)  # degrees
+_BIN = 0.005  # degrees
+_FAINT = 0.02  # share of the median peak's height below which a peak is not a beam
+_SAME = 0.02  # degrees: neighbouring lasers that are nearer are two returns of one
 # Successive bandwidths, a factor of 1.6, over which the number of peaks must be constant.
-STABLE = 6
+_STABLE = 6
 # Variance within rings over that of all, above which they are no beams; a tilt of 15 degrees has
 # 0.81.
-RINGLESS = 0.95
+_RINGLESS = 0.95
 # Median gap between elevations over their mean gap, above which a scan has no beams:
 # `_is_scattered`.
-SCATTERED = 0.3
-CROWDED = 20  # minimum mean number of points per sector for a comparison of gaps
+_SCATTERED = 0.3
+_CROWDED = 20  # minimum mean number of points per sector for a comparison of gaps
 
 RINGS = "a ring number at each point"
 FIRINGS = "firing after firing, rays without return kept"
@@ -93,7 +93,7 @@ def check_rings(points: Points) -> None:
     values = elevation[seen].astype(float)
     count = np.bincount(ring).clip(1)
     within = values - (np.bincount(ring, values) / count)[ring]
-    if len(values) and within.var() >= RINGLESS * values.var():
+    if len(values) and within.var() >= _RINGLESS * values.var():
         raise InputError(
             "its ring numbers contradict the beams: elevations of a ring differ as those of all "
             "points. Give --columns ring=_ (the field's name), and beams are found without them."
@@ -107,13 +107,13 @@ def _beams_of_files(files: Sequence[Points]) -> Beams:
     rings = [file.ring for file in files if file.ring is not None and file.ring.any()]
     if len(rings) == len(files):  # drivers without ring numbers write 0
         beams = _beams_of_lasers(together, rings, RINGS)
-        if np.mean(beams.off(files) ** 2) < RINGLESS * np.nanvar(together):
+        if np.mean(beams.off(files) ** 2) < _RINGLESS * np.nanvar(together):
             return beams
     count = _lasers_of_firings(elevations)
     if count:
         middle = median_of_seen(together.reshape(-1, count))
         laser = np.arange(len(together)) % count
-        if count % 2 == 0 and np.fmax.reduce(abs(middle[::2] - middle[1::2])) < SAME:
+        if count % 2 == 0 and np.fmax.reduce(abs(middle[::2] - middle[1::2])) < _SAME:
             laser //= 2
         return _beams_of_lasers(together, [laser], FIRINGS)
     peaks = _beams_of_elevations(together)
@@ -121,7 +121,7 @@ def _beams_of_files(files: Sequence[Points]) -> Beams:
     rings = [ring for ring in stored if ring is not None]
     if len(rings) == len(files):
         beams = _beams_of_lasers(together, rings, RING_AFTER_RING)
-        apart = -np.diff(beams.elevations).max() >= SAME
+        apart = -np.diff(beams.elevations).max() >= _SAME
         # A ring with few returns may be merged with the next; elevation peaks separate them.
         if apart and (peaks is None or len(peaks.elevations) <= len(beams.elevations)):
             return beams
@@ -151,8 +151,8 @@ def _is_scattered(scan: Points) -> bool:
     sector = np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])).astype(int)
     order = np.lexsort((elevation, sector))
     gaps = np.diff(elevation[order])[np.diff(sector[order]) == 0]
-    crowded = len(sector) >= CROWDED * max(len(np.unique(sector)), 1)
-    return crowded and np.median(gaps) > SCATTERED * gaps.mean()
+    crowded = len(sector) >= _CROWDED * max(len(np.unique(sector)), 1)
+    return crowded and np.median(gaps) > _SCATTERED * gaps.mean()
 
 
 def _beams_of_lasers(elevation: ndarray, lasers: Sequence[ndarray], order: str) -> Beams:
@@ -204,22 +204,22 @@ def _beams_of_elevations(elevation: ndarray) -> Beams | None:
     returned = np.isfinite(elevation)
     seen = elevation[returned]
     low, high = np.quantile(seen, [1e-4, 1 - 1e-4])
-    edges = np.arange(low - 3, high + 3 + BIN, BIN)
+    edges = np.arange(low - 3, high + 3 + _BIN, _BIN)
     size = 2 << len(edges).bit_length()  # the FFT of other sizes can be many times slower
     density = np.fft.rfft(np.histogram(seen, edges)[0], size)
     peaks_of = []
-    for bandwidth in BANDWIDTHS:
-        smooth = np.fft.irfft(fourier_gaussian(density, bandwidth / BIN, size))[: len(edges) - 1]
+    for bandwidth in _BANDWIDTHS:
+        smooth = np.fft.irfft(fourier_gaussian(density, bandwidth / _BIN, size))[: len(edges) - 1]
         before, here, after = smooth[:-2], smooth[1:-1], smooth[2:]
         # not scipy.signal.find_peaks, which takes half a second to import
         peaks = np.flatnonzero((before < here) & (here >= after)) + 1
         heights = smooth[peaks]
         # Returns from the vehicle itself have scattered elevations.
         typical = np.median(heights[heights > 0.01 * heights.max()])
-        peaks_of.append(edges[peaks[heights > FAINT * typical]] + BIN / 2)
+        peaks_of.append(edges[peaks[heights > _FAINT * typical]] + _BIN / 2)
     runs = [[*run] for count, run in groupby(peaks_of, len) if FEWEST <= count <= MOST]
     # The finest: wider ones merge weak beams with strong neighbours.
-    stable = next((run for run in runs if len(run) >= STABLE), None)
+    stable = next((run for run in runs if len(run) >= _STABLE), None)
     if stable is None:
         return None
     peaks = stable[(len(stable) - 1) // 2][::-1]

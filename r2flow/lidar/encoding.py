@@ -25,8 +25,8 @@ from r2flow.lidar.range_formats import FORMATS
 from r2flow.lidar.sensors import Sensor, build_sensor
 
 LIMIT_TOLERANCE = 1e-5  # relative, of closed range limits in decoding, for float32's rounding
-FULL = 1 + 1e-3  # maximum reflectance; larger values mean another scale
-LEAST = 0.05  # probability of a decoded label; all planes of a ray without label are -1
+_FULL = 1 + 1e-3  # maximum reflectance; larger values mean another scale
+_LEAST = 0.05  # probability of a decoded label; all planes of a ray without label are -1
 FAR = 300.0  # metres, above any scan's median range, unless its sensor has a larger limit
 
 
@@ -155,7 +155,7 @@ class Encoding:
             image = torch.cat([image, torch.where(returned, reflectance, 0.0)], dim=-3)
         if self.labels:
             probability, label = y[..., self.slices["label"], :, :].max(-3, keepdim=True)
-            labelled = returned & (probability > LEAST)
+            labelled = returned & (probability > _LEAST)
             label = torch.where(labelled, label + 1, 0)
             image = torch.cat(
                 [image, label.to(image), torch.where(labelled, probability, 0.0)], dim=-3
@@ -181,7 +181,7 @@ def wrong_with(image: Tensor, far: float = FAR) -> str | None:
             if max(-least, most) <= 1:
                 hint = "is it in model space ([-1, 1])? Decode it"
             return f"its {name} goes down to {least:.4g}; {hint}"
-        if name == "reflectance" and most > FULL:
+        if name == "reflectance" and most > _FULL:
             return (
                 f"its reflectance goes up to {most:.4g}, not 1; divide by its full scale, often 255"
             )

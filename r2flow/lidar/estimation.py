@@ -13,15 +13,15 @@ from r2flow.lidar.matching import nearest_sensor
 from r2flow.lidar.scan_files import FARTHEST_RAY, Points
 from r2flow.lidar.sensors import SENSORS, Sensor
 
-FEWEST_RETURNS = 200  # minimum for an estimate
+_FEWEST_RETURNS = 200  # minimum for an estimate
 COLUMNS = 64  # image widths are multiples of it, so that every backbone can halve them
 FULL_REFLECTANCE = (1.0, 100.0, 255.0, 256.0, 65535.0)  # common values of full reflectance
 # Bytes up to 100 may be of 255: above it are retroreflectors alone.
 SURE = FULL_REFLECTANCE[:1] + FULL_REFLECTANCE[2:]
 OUTLIERS = 0.05  # share of values beyond full reflectance, which are clipped
-STRAY = 1e-4  # the same, of values up to 4 times as large, as of a larger scale
-MOST_SIDES = 36  # azimuth sectors, in which the ground is looked for
-NARROWEST = 70.0  # degrees of azimuth: less is no turn, but the patch of a camera
+_STRAY = 1e-4  # the same, of values up to 4 times as large, as of a larger scale
+_MOST_SIDES = 36  # azimuth sectors, in which the ground is looked for
+_NARROWEST = 70.0  # degrees of azimuth: less is no turn, but the patch of a camera
 
 
 class Estimate(NamedTuple):
@@ -45,12 +45,12 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
     """
     xyz = np.concatenate([scan.xyz[scan.xyz.any(axis=1)] for scan in scans])
     check(
-        len(xyz) >= FEWEST_RETURNS,
-        f"{len(xyz)} returns are too few for an estimate: give at least {FEWEST_RETURNS}.",
+        len(xyz) >= _FEWEST_RETURNS,
+        f"{len(xyz)} returns are too few for an estimate: give at least {_FEWEST_RETURNS}.",
     )
     seen = len(np.unique(np.arctan2(xyz[:, 1], xyz[:, 0]) // np.radians(5))) * 5
     check(
-        seen >= NARROWEST,
+        seen >= _NARROWEST,
         f"the returns lie within {seen} degrees of azimuth: a scan is a turn of a spinning "
         "LiDAR, not the patch of a camera or a solid-state sensor.",
     )
@@ -88,16 +88,16 @@ def hangs(scans: Sequence[Points]) -> bool:
     xyz = np.concatenate([scan.xyz for scan in scans])
     below, _ = _level(xyz)
     above, sides = _level(xyz * np.array([1, 1, -1]))
-    return above > max(1.4 * below, FEWEST_RETURNS / 4) and sides >= MOST_SIDES / 2
+    return above > max(1.4 * below, _FEWEST_RETURNS / 4) and sides >= _MOST_SIDES / 2
 
 
 def _level(xyz: ndarray) -> tuple[int, int]:
     """Returns within 0.15 m of the most frequent height below the sensor, 3 to 20 m away, and the
-    number of `MOST_SIDES` azimuth sectors that they lie in.
+    number of `_MOST_SIDES` azimuth sectors that they lie in.
     """
     low, frequency, heights = _heights(xyz)
     x, y, _ = low[abs(low[:, 2] - heights[frequency.argmax()]) < 0.15].T
-    sides = np.floor(np.arctan2(y, x) * (MOST_SIDES / (2 * np.pi)))
+    sides = np.floor(np.arctan2(y, x) * (_MOST_SIDES / (2 * np.pi)))
     return len(x), len(np.unique(sides))
 
 
@@ -108,7 +108,7 @@ def _height(xyz: ndarray) -> float | None:
     """
     low, frequency, heights = _heights(xyz)
     most = frequency.max()
-    if most < FEWEST_RETURNS / 4:
+    if most < _FEWEST_RETURNS / 4:
         return None
     ground = heights[np.argmax(frequency > 0.7 * most)]
     z = low[:, 2]
@@ -181,4 +181,4 @@ def _is_full(full: float, values: ndarray) -> bool:
         return bool(beyond.mean() <= OUTLIERS and (fractions or not beyond.any()))
     # Bytes above 100 are retroreflectors, and as few as outliers.
     stray = np.mean(beyond & (values <= 4 * full))
-    return bool(beyond.mean() <= OUTLIERS and stray <= (STRAY if full > 100 else 0))
+    return bool(beyond.mean() <= OUTLIERS and stray <= (_STRAY if full > 100 else 0))

@@ -16,28 +16,30 @@ from r2flow.lidar.scan_files import Points
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.unfolding import elevations_of
 
-FEWEST_RETURNS = 1000  # for a judgement
-IN_VIEW = 0.9  # minimum share of returns in the sensor's view; tested real scans have 0.967 or more
-OFF = 1.5  # degrees, by `_distance`: beams at a larger distance are of another sensor
+_FEWEST_RETURNS = 1000  # for a judgement
+_IN_VIEW = (
+    0.9  # minimum share of returns in the sensor's view; tested real scans have 0.967 or more
+)
+_OFF = 1.5  # degrees, by `_distance`: beams at a larger distance are of another sensor
 # Share of rows between the beams: KITTI's scans have 0.02 at most, an OS1's .34 degrees off 0.16.
-MOST_VOID = 0.1
+_MOST_VOID = 0.1
 # Degrees, by the median, between points and beams: real scans have 0.35 at most, two in one 0.39.
-MOST_OFF = 0.37
-BEATEN = 0.5  # degrees: beyond it, a sensor does not match if another sensor is twice as near
-TILTS = np.arange(-10, 10.5, 0.5)  # degrees
+_MOST_OFF = 0.37
+_BEATEN = 0.5  # degrees: beyond it, a sensor does not match if another sensor is twice as near
+_TILTS = np.arange(-10, 10.5, 0.5)  # degrees
 # Degrees: a smaller tilt is not another frame; KITTI's odometry scans have half a degree.
-LEVEL = 1.0
+_LEVEL = 1.0
 # Beams this much clearer after a larger tilt are of another frame; real scans have 1.03 at most.
-CLEARER = 1.12
+_CLEARER = 1.12
 
 
 class Doubt(NamedTuple):
     """Why scans do not fit a sensor."""
 
     seen: str  # what was seen in them
-    name: str | None  # the nearest built-in sensor within `OFF`
+    name: str | None  # the nearest built-in sensor within `_OFF`
     hopeless: bool = False  # whether they have no beams
-    sure: bool = False  # whether the nearest sensor is within `BEATEN`
+    sure: bool = False  # whether the nearest sensor is within `_BEATEN`
     finer: bool = False  # whether it is the sensor itself, with rows between the scans' beams
 
 
@@ -50,7 +52,7 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
     """
     elevation = np.concatenate([elevations_of(scan.xyz) for scan in scans])
     elevation = elevation[np.isfinite(elevation)]
-    if len(elevation) < FEWEST_RETURNS:
+    if len(elevation) < _FEWEST_RETURNS:
         return None
     edges = sensor.row_edges
     count, _ = np.histogram(-elevation, -edges)
@@ -65,7 +67,7 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
     except InputError:
         nearest = np.searchsorted(-whole.row_edges[1:-1], -elevation)
         off = np.median(abs(elevation - np.asarray(whole.elevations)[nearest]))
-        fits = share >= IN_VIEW and off < MOST_OFF
+        fits = share >= _IN_VIEW and off < _MOST_OFF
         return None if fits else Doubt(f"{seen}, {off:.1f} degrees off its beams", None)
     name, near = nearest_sensor(beams)
     rows = len(sensor.elevations)
@@ -80,8 +82,8 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
             (other.elevations, 1) for other in SENSORS.values() if _family(other.name) == family
         ]
         distance, every = min((_distance(beams, table), n) for table, n in tables)
-    if share < IN_VIEW or distance >= OFF or (distance > BEATEN and near < distance / 2):
-        return Doubt(f"they have {in_words(beams)}, {seen}", name, sure=near < BEATEN)
+    if share < _IN_VIEW or distance >= _OFF or (distance > _BEATEN and near < distance / 2):
+        return Doubt(f"they have {in_words(beams)}, {seen}", name, sure=near < _BEATEN)
     if every > 1:
         seen = f"they have {len(beams)} beams, one of every {every} of its rows"
         return Doubt(seen, None, finer=True)
@@ -91,7 +93,7 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
         filled = np.searchsorted(-edges, -beams)
         widest = np.diff(filled).max(initial=1) - 1  # a crop of near points leaves a wide gap
     void = np.diff(filled) - 1
-    if void.sum() - widest <= rows * MOST_VOID or rows > len(whole.elevations):
+    if void.sum() - widest <= rows * _MOST_VOID or rows > len(whole.elevations):
         return None
     void = void.clip(0).sum()
     return Doubt(f"{void} of its {rows} rows lie between their beams and stay empty", None)
@@ -105,23 +107,23 @@ def is_tilted(scans: Sequence[Points]) -> bool:
     """
     xyz = np.concatenate([scan.xyz for scan in scans])
     xyz = xyz[np.isfinite(elevations_of(xyz))]
-    if len(xyz) < FEWEST_RETURNS:
+    if len(xyz) < _FEWEST_RETURNS:
         return False
     xyz = xyz[np.random.default_rng(0).integers(len(xyz), size=5000)]
     elevation = 110 + elevations_of(xyz)
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
     ahead = np.stack([np.cos(azimuth), np.sin(azimuth)])
-    tilts = np.array([*product(TILTS, TILTS)])
+    tilts = np.array([*product(_TILTS, _TILTS)])
     bins = [((elevation - tilt @ ahead) / 0.05).astype(int) for tilt in tilts]
     clear = np.array([(np.convolve(np.bincount(one), np.ones(5)) ** 2).sum() for one in bins])
-    level = clear[abs(tilts).max(axis=1) <= LEVEL].max()
-    return bool(clear.max() > CLEARER * level)
+    level = clear[abs(tilts).max(axis=1) <= _LEVEL].max()
+    return bool(clear.max() > _CLEARER * level)
 
 
 def is_unclear(scans: Sequence[Points]) -> bool:
     """Whether points lie far from their beams, as of two sensors in one file, or `is_tilted`."""
     with suppress(InputError):
-        if np.median(find_beams(*scans).off(scans)) > MOST_OFF:
+        if np.median(find_beams(*scans).off(scans)) > _MOST_OFF:
             return True
     return is_tilted(scans)
 
@@ -142,14 +144,14 @@ def differing(scans: Sequence[Points]) -> list[tuple[int, ndarray]]:
 
 def _differ(one: ndarray, other: ndarray) -> bool:
     """Whether beams are of two sensors: the built-in ones nearest to them are others, or they are
-    `OFF` (those of KITTI's scans 1.4 degrees at most). Some of the beams are of the same sensor.
+    `_OFF` (those of KITTI's scans 1.4 degrees at most). Some of the beams are of the same sensor.
     """
     few, many = sorted((one, other), key=len)
     apart = abs(few[:, None] - many).min(axis=1)
     if np.median(apart) < np.median(-np.diff(many)) / 10:
         return False
     names = {nearest_sensor(beams)[0] for beams in (one, other)} - {None}
-    return len(names) > 1 or min(_distance(one, other), _distance(other, one)) >= OFF
+    return len(names) > 1 or min(_distance(one, other), _distance(other, one)) >= _OFF
 
 
 def in_words(elevations: Sequence[float] | ndarray) -> str:
@@ -160,12 +162,12 @@ def in_words(elevations: Sequence[float] | ndarray) -> str:
 def nearest_sensor(elevations: ndarray) -> tuple[str | None, float]:
     """The built-in sensor nearest to beam elevations in degrees, or None, and the distance.
 
-    None is beyond `OFF`.
+    None is beyond `_OFF`.
     """
     distance, name = min(
         (_distance(elevations, sensor.elevations), name) for name, sensor in SENSORS.items()
     )
-    return _family(name) if distance < OFF else None, distance
+    return _family(name) if distance < _OFF else None, distance
 
 
 def _family(name: str) -> str:

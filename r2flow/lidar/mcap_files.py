@@ -11,9 +11,9 @@ from typing import Any
 from r2flow.base.errors import InputError, check, require
 from r2flow.lidar.bags import Channel, Message, Recording, short_kind
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
-LARGEST_CHUNK = 1 << 30  # bytes unpacked; writers close them after a few MB
+_LARGEST_CHUNK = 1 << 30  # bytes unpacked; writers close them after a few MB
 
 
 @contextmanager
@@ -35,7 +35,7 @@ def open_mcap(path: Path) -> Iterator[Recording]:
             summary = None if cut else reader.get_summary()
         sizes = [chunk.uncompressed_size for chunk in summary.chunk_indexes] if summary else []
         check(
-            max(sizes, default=0) <= LARGEST_CHUNK,
+            max(sizes, default=0) <= _LARGEST_CHUNK,
             f"it has a chunk of {max(sizes, default=0):,} bytes, more than 1 GiB.",
         )
         indexed = summary is not None and summary.channels and summary.schemas
@@ -64,7 +64,7 @@ def open_mcap(path: Path) -> Iterator[Recording]:
             channels, sort = _counted(stored(None, False))
         if cut:
             check(channels, "it was cut off, as by a crash, and holds no whole message.")
-            log.warning(
+            _log.warning(
                 "%s was cut off, as by a crash: its %d whole messages are used.",
                 path,
                 sum(channel.count for channel in channels),

@@ -15,7 +15,7 @@ from r2flow.lidar.bags import Message, read_bag
 from r2flow.lidar.point_cloud2 import CLOUD, written
 from r2flow.lidar.scan_files import Cloud, read_cloud, scan_ending, write_cloud
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _FRAME = "frame_id "  # before it in a comment of a .ply
 _SECOND = 10**9
@@ -43,7 +43,7 @@ def unpack(
                 raise scan
             scan.cloud.points()  # other verbs read it
         except InputError as error:
-            log.warning("left out: at %d: %s", stamp, error)
+            _log.warning("left out: at %d: %s", stamp, error)
             continue
         stamps[stamp] += 1
         cloud = scan.cloud

@@ -10,7 +10,7 @@ from r2flow.base.registry import Registry
 from r2flow.lidar.sensors import Sensor
 
 
-class RangeFormat:
+class _RangeFormat:
     """Maps ranges r in metres, (..., 1, H, W), to values y in [0, 1] and back: r / r_max."""
 
     def __init__(self, sensor: Sensor) -> None:
@@ -24,7 +24,7 @@ class RangeFormat:
         return y * self.max_range
 
 
-class LogScale(RangeFormat):
+class _LogScale(_RangeFormat):
     """log2(r + 1) / log2(r_max + 1), the paper's eq. 5: finer near the sensor."""
 
     def __init__(self, sensor: Sensor) -> None:
@@ -37,7 +37,7 @@ class LogScale(RangeFormat):
         return torch.exp2(y * self.scale) - 1
 
 
-class ShiftedLog(LogScale):
+class ShiftedLog(_LogScale):
     """log2(r + 1.0001) / scale, with scale = log2(r_max + 1) rounded up to hundredths.
 
     Used by LiDARGen (r_max 63 m, scale 6) and LiDM (56 m, 5.84). A ray without return is
@@ -54,7 +54,7 @@ class ShiftedLog(LogScale):
         return super().inverse(y.clamp(0, 1))
 
 
-class Inverse(RangeFormat):
+class _Inverse(_RangeFormat):
     """r_min / r, 0 for no return.
 
     float32 resolves r to r^2 / r_min 2^-26: 2 mm for limits of 0.3 and 200 m.
@@ -66,7 +66,7 @@ class Inverse(RangeFormat):
     inverse = forward  # type: ignore[assignment]
 
 
-class InverseDepth(Inverse):
+class _InverseDepth(_Inverse):
     """r_min / r within the range limits, else 0, in both directions, as in DUSty: no tolerance."""
 
     def forward(self, r: Tensor) -> Tensor:
@@ -78,11 +78,11 @@ class InverseDepth(Inverse):
         return torch.where(inside, super().inverse(y), 0.0)
 
 
-FORMATS: Registry[Callable[[Sensor], RangeFormat]] = Registry(
+FORMATS: Registry[Callable[[Sensor], _RangeFormat]] = Registry(
     "range format",
-    logscale=LogScale,
+    logscale=_LogScale,
     shifted_log=ShiftedLog,
-    inverse=Inverse,
-    inverse_depth=InverseDepth,
-    metric=RangeFormat,
+    inverse=_Inverse,
+    inverse_depth=_InverseDepth,
+    metric=_RangeFormat,
 )

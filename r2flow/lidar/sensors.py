@@ -21,7 +21,7 @@ from r2flow.base.registry import Registry, check_options, construct, options_of
 Rays = Literal["centre", "reference"]
 Convention = Literal[Rays, "lidargen", "lidm"]
 
-MOST_PIXELS = 1 << 24  # of an image, 128 x 131,072: more than any sensor has, but within memory
+_MOST_PIXELS = 1 << 24  # of an image, 128 x 131,072: more than any sensor has, but within memory
 ENDINGS = (".yaml", ".yml")
 
 
@@ -56,8 +56,8 @@ class Sensor:
             "elevations must be two or more, from the top row down within (-90, 90) degrees": (
                 rows > 1 and all(upper > lower for upper, lower in pairwise(inside))
             ),
-            f"columns must be 1 or more, with at most {MOST_PIXELS:,} pixels": (
-                self.columns >= 1 and rows * self.columns <= MOST_PIXELS
+            f"columns must be 1 or more, with at most {_MOST_PIXELS:,} pixels": (
+                self.columns >= 1 and rows * self.columns <= _MOST_PIXELS
             ),
             "needs 0 < min_range < max_range in metres": 0 < self.min_range < self.max_range < inf,
             "height must be metres above the ground": 0 < self.height < inf,
@@ -136,7 +136,7 @@ class Sensor:
         old = len(e)
         if rows is None or rows == old:
             return sensor
-        most = MOST_PIXELS // sensor.columns
+        most = _MOST_PIXELS // sensor.columns
         check(
             2 <= rows <= most,
             f"sensor {quoted(self.name)}: rows must be 2 to {most:,}, found {rows}.",

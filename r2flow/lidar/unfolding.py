@@ -9,8 +9,8 @@ from scipy import ndimage
 from r2flow.base.errors import InputError
 from r2flow.lidar.sensors import Convention, Sensor
 
-NOISE = 0.1  # degrees by which a laser may lie above that of the row before it in any case
-FEW = 5  # returns below which the median elevation of a ring is not known
+_NOISE = 0.1  # degrees by which a laser may lie above that of the row before it in any case
+_FEW = 5  # returns below which the median elevation of a ring is not known
 # limits of the number of beams
 FEWEST = 4
 MOST = 256
@@ -154,7 +154,7 @@ def _rows_from_field(xyz: ndarray, ring: ndarray, sensor: Sensor) -> ndarray:
     if numbers[0] > 0 and highest <= rows:
         # Elevations decide if neither the first nor the last ring has a return.
         from_0, from_1 = (
-            _misfit(part, best_order(part, sensor)[0], sensor)
+            _misfit(part, _best_order(part, sensor)[0], sensor)
             for part in (elevation[:rows], elevation[1 : rows + 1])
         )
         first = int(highest == rows or from_1 < from_0 / 2)
@@ -164,7 +164,7 @@ def _rows_from_field(xyz: ndarray, ring: ndarray, sensor: Sensor) -> ndarray:
         known = np.isfinite(elevation)
         fits = len(set(order[known])) == known.sum()
     elif rows / 2 <= last + 1 <= rows:
-        order, fits = best_order(elevation[first : first + rows], sensor)
+        order, fits = _best_order(elevation[first : first + rows], sensor)
     else:
         raise InputError(
             f"the scan has ring numbers up to {last}, but sensor '{sensor.name}' has {rows} rows. "
@@ -182,7 +182,7 @@ def _median_elevations(xyz: ndarray, ring: ndarray, rings: int) -> ndarray:
     """Median elevation of each ring in degrees, (rings,); NaN for rings with few returns."""
     elevation = elevations_of(xyz)
     seen = np.isfinite(elevation)
-    many = np.flatnonzero(np.bincount(ring[seen], minlength=rings) >= FEW)
+    many = np.flatnonzero(np.bincount(ring[seen], minlength=rings) >= _FEW)
     middles = np.full(rings, np.nan)
     middles[many] = ndimage.median(elevation[seen], ring[seen], many)
     return middles
@@ -204,7 +204,7 @@ def _rows_from_firings(xyz: ndarray, sensor: Sensor) -> ndarray | None:
     table = few_firings(xyz.reshape(firings, rows, 3))
     elevation = elevations_of(table.reshape(-1, 3)).reshape(-1, rows)
     middle, scatter = scatter_of(elevation)
-    order, fits = best_order(middle, sensor)
+    order, fits = _best_order(middle, sensor)
     return np.tile(order, firings) if scatter < 0.25 and fits else None
 
 
@@ -242,7 +242,7 @@ def median_of_seen(values: ndarray) -> ndarray:
     return np.where(seen > 0, middle, np.nan)
 
 
-def best_order(elevation: ndarray, sensor: Sensor) -> tuple[ndarray, bool]:
+def _best_order(elevation: ndarray, sensor: Sensor) -> tuple[ndarray, bool]:
     """Row of each laser, (H,) int64, in the order that best fits their elevations.
 
     Candidates are top-down, bottom-up and the sensor's firing order.
@@ -260,7 +260,7 @@ def best_order(elevation: ndarray, sensor: Sensor) -> tuple[ndarray, bool]:
         by_row = elevation[np.argsort(order)]
         seen = np.isfinite(by_row)
         apart = -np.diff(np.asarray(sensor.elevations)[seen])
-        wrong = np.diff(by_row[seen]) > np.maximum(apart / 2, NOISE)
+        wrong = np.diff(by_row[seen]) > np.maximum(apart / 2, _NOISE)
         misfits.append((wrong.sum(), _misfit(elevation, order, sensor)))
     best = misfits.index(min(misfits))
     return orders[best], misfits[best][0] == 0

@@ -83,7 +83,7 @@ def published_config(cfg: Options) -> Config:
         "stage": stage,
         "sensor": {**sensor_of("hdl64e", data["resolution"], data), "rays": "reference"},
         "encoding": {"format": data["data_format"], "reflectance": bool(data["train_reflectance"])},
-        "backbone": backbone_of(cfg["model"]),
+        "backbone": _backbone_of(cfg["model"]),
         "data": {
             "name": data["dataset"],
             "reading": {
@@ -95,7 +95,7 @@ def published_config(cfg: Options) -> Config:
     }
 
 
-def backbone_of(model: Options) -> Config:
+def _backbone_of(model: Options) -> Config:
     """Backbone options from a published config's `model`."""
     heads = model["attn_num_heads"]
     blocks = model["num_residual_blocks"]
@@ -126,7 +126,7 @@ def rings_of(config: Options, weights: Mapping[str, Tensor]) -> Tensor | None:
     return weights[BACKBONE + "coords"][0, 0, :, 0] if unfolded else None
 
 
-class Inert:
+class _Inert:
     """Placeholder for unpickled objects: keeps the pickled state without running code."""
 
     def __init__(self, *arguments: Any) -> None:
@@ -148,13 +148,13 @@ NAMES = (
 
 
 def inert() -> Any:
-    """Context in which `torch.load(weights_only=True)` reads the classes in `NAMES` as `Inert`."""
-    return torch.serialization.safe_globals([(Inert, name) for name in NAMES])
+    """Context in which `torch.load(weights_only=True)` reads the classes in `NAMES` as `_Inert`."""
+    return torch.serialization.safe_globals([(_Inert, name) for name in NAMES])
 
 
 def plain(value: Any) -> Any:
-    """Convert an `Inert` config or node to a plain value; other values are returned unchanged."""
-    if not isinstance(value, Inert):
+    """Convert an `_Inert` config or node to a plain value; other values are returned unchanged."""
+    if not isinstance(value, _Inert):
         return value
     content = vars(value).get("_val", vars(value).get("_content"))
     if isinstance(content, dict):

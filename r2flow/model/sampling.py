@@ -16,7 +16,7 @@ from r2flow.generators import Answers, Condition, Generator, Sampler
 from r2flow.generators.base import Precision, Progress
 from r2flow.lidar.region import Region
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 
 class HasGenerator(Protocol):
@@ -139,7 +139,7 @@ def warn_unsolved(converged: Tensor, first: int = 0, of: str = "") -> None:
     """Warn about unconverged scans; `first` is the number of the first scan, `of` says of what."""
     if not converged.all():
         lost = (first + (~converged).nonzero()[:, 0]).tolist()
-        log.warning(
+        _log.warning(
             "not solved, so no scans of this flow: %s%s; try another solver, or for a velocity "
             "that is singular at t = "
             "1 a last step before it: --sampler adams3:finish=0.001.",

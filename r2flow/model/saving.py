@@ -17,7 +17,7 @@ from r2flow.model.published import BACKBONE
 if TYPE_CHECKING:
     from r2flow.model.checkpoint import Checkpoint
 
-SMALL = 256  # largest matrix, in elements, that `half` leaves in float32, as it does all vectors
+_SMALL = 256  # largest matrix, in elements, that `half` leaves in float32, as it does all vectors
 
 
 def weights_hash(checkpoint: "Checkpoint") -> str:
@@ -50,7 +50,7 @@ def save_checkpoint(checkpoint: "Checkpoint", path: str | Path, half: bool = Fal
         for name, value in checkpoint.generator.state_dict().items()
     }
     for name, value in checkpoint.generator.named_parameters() if half else ():
-        if value.ndim > 1 and value.numel() > SMALL:
+        if value.ndim > 1 and value.numel() > _SMALL:
             name = name.replace(COMPILED, "")
             weights[name] = weights[name].half()
             check(

@@ -13,7 +13,7 @@ FOLDER = Path(__file__).with_name("weights")
 
 
 @dataclass(frozen=True)
-class Model:
+class _Model:
     """A trained generator with a name."""
 
     about: str  # generated scans and training data
@@ -21,21 +21,21 @@ class Model:
     licence: str = "MIT"
 
 
-MODELS: Registry[Model] = Registry(
+MODELS: Registry[_Model] = Registry(
     "model",
-    street=Model(
+    street=_Model(
         "street scenes in any number of evaluations, learned from simulated scans",
         "9177ee104c65d06690c4f1719eed8bda524704e7d631c371689ef7e3cec0f9d1",
     ),
-    densify=Model(
+    densify=_Model(
         "scans of few beams or points completed to all, learned from simulated scans",
         "3bf412e171f7e822f6411250b090af8a920d20b00c1a5f86f6d61eb62a213712",
     ),
-    labels=Model(
+    labels=_Model(
         "labels of scans, scans of labels and denser scans with both, from simulated scans",
         "3c173b5af27dc25516fdc24240cb4ea92533371668b6ba3013ea1404c13f126d",
     ),
-    densify_small=Model(
+    densify_small=_Model(
         "as densify with nearly its errors, in half of its time, learned from it",
         "4a5832556d65a6085aec763045b8fed73bae36f7919ac7440af56e4027f24c05",
     ),

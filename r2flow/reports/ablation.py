@@ -33,10 +33,10 @@ from r2flow.reports.backbones import cost
 from r2flow.reports.tables import Row
 
 TIMES = (0.1, 0.3, 0.5, 0.7, 0.9)  # of the error of x_1
-BATCH = 8
-PATHS = 8  # scans of the bend
+_BATCH = 8
+_PATHS = 8  # scans of the bend
 _METRICS = ("things", "jsd", "mmd", "kid_handcrafted_range", "frechet_handcrafted_range")
-_WORK = Work(BATCH)
+_WORK = Work(_BATCH)
 _TEXTS = ("combination", "model", "sampler", "settings")  # columns that are no numbers
 # Samplers and numbers of steps by a generator's default sampler; of others it is the only one.
 _SYSTEMS: Mapping[str, Mapping[str, Sequence[int]]] = {
@@ -122,12 +122,12 @@ def _samplers(generator: Generator, evaluations: Sequence[int] | None) -> list[S
 
 
 def _drawn(checkpoint: Checkpoint, num: int, sampler: Sampler) -> tuple[Tensor, Row]:
-    """Scans, with the processor seconds of one and the memory of a batch of `BATCH`, in MiB."""
+    """Scans, with the processor seconds of one and the memory of a batch of `_BATCH`, in MiB."""
     source = sampled_set(checkpoint, "", num, sampler).source
     source.batch([0])  # the first call is slower
     before = _resident(reset=True)
     begin = time.process_time()
-    batches = [source.batch(range(i, min(i + BATCH, num))) for i in range(0, num, BATCH)]
+    batches = [source.batch(range(i, min(i + _BATCH, num))) for i in range(0, num, _BATCH)]
     seconds = (time.process_time() - begin) / num
     return torch.cat(batches), {"seconds a scan": seconds, "MiB": _resident("VmHWM") - before}
 
@@ -157,14 +157,14 @@ def _of_velocity(checkpoint: Checkpoint, real: ScanSet, device: str) -> Row:
     if flow.fixed:
         return {}
     squares = torch.zeros(len(TIMES), dtype=torch.float64)
-    for first in range(0, len(real), BATCH):
-        images = real[first : first + BATCH]
+    for first in range(0, len(real), _BATCH):
+        images = real[first : first + _BATCH]
         x_1 = flow.space.encoding.encode(images).to(device)
         x_0 = Draws(0, range(first, first + len(x_1))).start(flow.noise_shape).to(device)
         squares += _squared_errors(flow, x_0, x_1)
     rms = (squares / len(real)).sqrt().tolist()
     errors = {f"error of x_1, t = {t}": value for t, value in zip(TIMES, rms, strict=True)}
-    noise = Draws(0, range(PATHS)).start(flow.noise_shape).to(device)
+    noise = Draws(0, range(_PATHS)).start(flow.noise_shape).to(device)
     bend = straightness(flow.velocity, noise, steps=16).s_normalised.mean().item()
     return {**errors, "bend": bend}
 

@@ -14,7 +14,7 @@ from r2flow.reports.figures import Plot, lines_figure
 from r2flow.reports.pages import Page
 from r2flow.reports.tables import Part, Row, Table
 
-DISTANCE = "distance of ranges"
+_DISTANCE = "distance of ranges"
 COLUMNS = {
     "combination": "combination",
     "model": "model",
@@ -34,7 +34,7 @@ COLUMNS = {
     "GMAC": "GMAC",
     "images": "images",
 }
-RULE = (
+_RULE = (
     "Distance: the panel's mean without reflectance, which some systems do not draw, ± 2 standard "
     "errors: over the seeds, or of one seed over its samples. KID, Fréchet: of features of ranges. "
     "Copies: median distance to the nearest training scan. Error of x_1: at t = 0.5. Seconds and "
@@ -42,7 +42,7 @@ RULE = (
 )
 _AS_FAST = 1.1  # largest ratio of equal seconds a scan
 
-Systems = Mapping[str, Sequence[Row]]  # rows of each combination
+_Systems = Mapping[str, Sequence[Row]]  # rows of each combination
 
 
 def over_seeds(rows: Iterable[Row]) -> list[Row]:
@@ -56,8 +56,8 @@ def over_seeds(rows: Iterable[Row]) -> list[Row]:
         numbers = [key for key, value in group[0].items() if isinstance(value, int | float)]
         mean = group[0] | {key: fmean(row[key] for row in group) for key in numbers}
         if len(group) > 1:
-            mean["error"] = stdev(row[DISTANCE] for row in group) / math.sqrt(len(group))
-        means.append(mean | {"shown": f"{mean[DISTANCE]:.3f} ± {2 * mean['error']:.3f}"})
+            mean["error"] = stdev(row[_DISTANCE] for row in group) / math.sqrt(len(group))
+        means.append(mean | {"shown": f"{mean[_DISTANCE]:.3f} ± {2 * mean['error']:.3f}"})
     return means
 
 
@@ -65,14 +65,14 @@ def frontier(rows: Iterable[Row]) -> list[Row]:
     """The rows nearer than every faster one, by their seconds a scan."""
     kept: list[Row] = []
     for row in sorted(rows, key=lambda row: row["seconds a scan"]):
-        if not kept or row[DISTANCE] < kept[-1][DISTANCE]:
+        if not kept or row[_DISTANCE] < kept[-1][_DISTANCE]:
             kept.append(row)
     return kept
 
 
 def verdict(ours: Row, other: Row) -> str:
     """Whether one row is ahead of another, level or behind."""
-    difference = other[DISTANCE] - ours[DISTANCE]
+    difference = other[_DISTANCE] - ours[_DISTANCE]
     if abs(difference) <= 2 * (ours["error"] + other["error"]):
         return "level"
     return "ahead" if difference > 0 else "behind"
@@ -82,10 +82,10 @@ def _against(ours: Row, rows: Sequence[Row]) -> str:
     """The verdict against another's best row that is as fast, else against its fastest one."""
     fast = [r for r in rows if r["seconds a scan"] <= _AS_FAST * ours["seconds a scan"]]
     other = frontier(fast or rows)[-1 if fast else 0]
-    return f"{verdict(ours, other)} ({'' if fast else 'slower, '}{other[DISTANCE]:.3f})"
+    return f"{verdict(ours, other)} ({'' if fast else 'slower, '}{other[_DISTANCE]:.3f})"
 
 
-def compared(systems: Systems) -> list[Row]:
+def compared(systems: _Systems) -> list[Row]:
     """The best row of the first combination in each number of evaluations against the others at
     equal seconds a scan.
     """
@@ -93,7 +93,7 @@ def compared(systems: Systems) -> list[Row]:
     found = []
     for count in sorted({row["evaluations"] for row in systems[first]}):
         rows = [row for row in systems[first] if row["evaluations"] == count]
-        best = min(rows, key=lambda row: row[DISTANCE])
+        best = min(rows, key=lambda row: row[_DISTANCE])
         row = {"in": f"{count:g}", "model": best["model"], first: best["shown"]}
         found.append(row | {name: _against(best, systems[name]) for name in others})
     return found
@@ -108,7 +108,7 @@ def ablation_page(
     The training scans are the table's first row, the best baseline is its last one.
     """
     references = over_seeds(row for row in rows if not row["budget"])
-    last = min(references[1:], key=lambda row: row[DISTANCE])
+    last = min(references[1:], key=lambda row: row[_DISTANCE])
     systems: dict[str, list[Row]] = {}
     learned: dict[str, Row] = {}
     for name in names:
@@ -116,7 +116,7 @@ def ablation_page(
         systems[name] = over_seeds(row for row in runs if row["budget"] == budget)
         learned[name] = {"combination": name}
         for seconds in sorted({row["budget"] for row in runs}):
-            distances = [row[DISTANCE] for row in runs if row["budget"] == seconds]
+            distances = [row[_DISTANCE] for row in runs if row["budget"] == seconds]
             learned[name][f"{seconds / 60:.3g} min"] = min(distances)
     lines = [references[0], *(row for each in systems.values() for row in each), last]
     against = compared(systems)
@@ -124,17 +124,17 @@ def ablation_page(
     text: list[Part] = [
         f"{next(iter(systems))} at equal seconds a scan, by network evaluations:",
         Table(against, {key: key for key in against[0]}),
-        f"Smallest distance by training time; {last['combination']}: {last[DISTANCE]:.3f}.",
+        f"Smallest distance by training time; {last['combination']}: {last[_DISTANCE]:.3f}.",
         Table(list(learned.values()), headings),
         about,
         Table(lines, COLUMNS),
-        RULE,
+        _RULE,
     ]
     figures = {"ablation": _figure(systems, [references[0], last])}
     return Page("ablation", "Equal training time", text, lines, figures, {}, device)
 
 
-def _figure(systems: Systems, references: Sequence[Row]) -> Figure:
+def _figure(systems: _Systems, references: Sequence[Row]) -> Figure:
     """Distance against seconds and, of backbones, GMAC a scan: all rows as points with bars, those
     that no faster one beats as a line.
     """
@@ -144,7 +144,7 @@ def _figure(systems: Systems, references: Sequence[Row]) -> Figure:
     best = {name: frontier(rows) for name, rows in systems.items()}
     plots = []
     for label, x in axes.items():
-        lines = {n: ([*map(x, rows)], [r[DISTANCE] for r in rows]) for n, rows in best.items()}
+        lines = {n: ([*map(x, rows)], [r[_DISTANCE] for r in rows]) for n, rows in best.items()}
         plots.append(Plot(label, "distance", lines, log_x=True))
     figure = lines_figure(plots, 2)
     for panel, x in zip(figure.axes, axes.values(), strict=True):
@@ -157,12 +157,12 @@ def _figure(systems: Systems, references: Sequence[Row]) -> Figure:
                 "alpha": 0.5,
             }
             bars = [2 * row["error"] for row in rows]
-            panel.errorbar([*map(x, rows)], [row[DISTANCE] for row in rows], bars, **style)
+            panel.errorbar([*map(x, rows)], [row[_DISTANCE] for row in rows], bars, **style)
         for row in references:
-            panel.axhline(row[DISTANCE], color="0.4", lw=0.8, ls=":")
+            panel.axhline(row[_DISTANCE], color="0.4", lw=0.8, ls=":")
             panel.annotate(
                 row["combination"],
-                (1, row[DISTANCE]),
+                (1, row[_DISTANCE]),
                 xycoords=("axes fraction", "data"),
                 ha="right",
             )

@@ -19,12 +19,12 @@ from r2flow.reports.answer_rays import Answered
 from r2flow.reports.completion import INTERPOLATIONS
 
 COMPARE = "compare.json"
-COMMON = "mae_common_m"  # where the truth, the answer and all interpolations return
+_COMMON = "mae_common_m"  # where the truth, the answer and all interpolations return
 
 
 class Compared(NamedTuple):
     """A completed scan beside the truth, as images of range and reflectance, (2 or 1, H, W), with
-    errors at the hidden rays by keys of `r2flow.metrics.completion.UNITS` and `COMMON`.
+    errors at the hidden rays by keys of `r2flow.metrics.completion.UNITS` and `_COMMON`.
     """
 
     truth: ndarray
@@ -55,8 +55,8 @@ def compared(measured: Partial, answered: Answered, sensor: Sensor) -> Compared:
         truth,
         rules[best],
         list(INTERPOLATIONS)[best],
-        {COMMON: common[0], **errors(truth, answer, hidden, sensor)},
-        {COMMON: common[1 + best], **errors(truth, rules[best], hidden, sensor)},
+        {_COMMON: common[0], **errors(truth, answer, hidden, sensor)},
+        {_COMMON: common[1 + best], **errors(truth, rules[best], hidden, sensor)},
     )
 
 
@@ -84,7 +84,7 @@ def in_words(found: Sequence[Compared]) -> str:
     names = " or ".join(dict.fromkeys(one.name for one in found))
     wrong = "drop_wrong"
     return (
-        f"at hidden rays: mean error {mean(rows, COMMON):.3f} m, best interpolation ({names}) "
-        f"{mean(others, COMMON):.3f} m; wrong in ray-drop {mean(rows, wrong):.1%}, "
+        f"at hidden rays: mean error {mean(rows, _COMMON):.3f} m, best interpolation ({names}) "
+        f"{mean(others, _COMMON):.3f} m; wrong in ray-drop {mean(rows, wrong):.1%}, "
         f"{mean(others, wrong):.1%}"
     )

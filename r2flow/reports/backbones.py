@@ -22,7 +22,7 @@ from r2flow.lidar.sensors import Sensor
 from r2flow.reports.pages import Page
 from r2flow.reports.tables import Part, Row, Table
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 RULE = (
     "MACs of convolutions, matrix products, neighbourhood attention on the padded ring and group "
@@ -38,10 +38,10 @@ _COLUMNS = {
     "error": "",
 }
 
-ATEN = torch.ops.aten
+_ATEN = torch.ops.aten
 # Two operations a multiply-accumulate, as torch's counter.
-OPERATIONS: dict[Any, Callable[..., int]] = {
-    ATEN.native_group_norm: lambda x, weight, *_, **__: 2 * math.prod(x) * (5 if weight else 4),
+_OPERATIONS: dict[Any, Callable[..., int]] = {
+    _ATEN.native_group_norm: lambda x, weight, *_, **__: 2 * math.prod(x) * (5 if weight else 4),
 }
 
 
@@ -54,7 +54,7 @@ class _FusedAttention(TorchDispatchMode):
     def __torch_dispatch__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
     ) -> Any:
-        if func is ATEN.scaled_dot_product_attention.default:
+        if func is _ATEN.scaled_dot_product_attention.default:
             query, _, value = args[:3]
             return query.new_empty(*query.shape[:-1], value.shape[-1])
         return func(*args, **(kwargs or {}))
@@ -110,7 +110,7 @@ def count_macs(model: Backbone) -> int:
         module.register_forward_hook(leave)
     with (
         torch.inference_mode(),
-        FlopCounterMode(display=False, custom_mapping=OPERATIONS) as counter,
+        FlopCounterMode(display=False, custom_mapping=_OPERATIONS) as counter,
         _FusedAttention(),  # within the counter, so that it comes first
     ):
         model(torch.empty(1, device="meta"), x)
@@ -176,7 +176,7 @@ def _cost_of(model: Backbone, repeats: int, device: str) -> Row:
     return row
 
 
-def timed(call: Callable[[], T], device: torch.device | str = "cpu") -> tuple[T, float]:
+def timed(call: Callable[[], _T], device: torch.device | str = "cpu") -> tuple[_T, float]:
     """Result of a call and its duration in seconds, including work on the device."""
     wait = (
         torch.accelerator.synchronize if torch.device(device).type != "cpu" else lambda device: None

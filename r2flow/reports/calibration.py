@@ -23,7 +23,7 @@ from r2flow.model.paths import title_of
 from r2flow.reports.completion import kept_rays
 from r2flow.samplers import Jump
 
-LEVELS = (0.68, 0.95)
+_LEVELS = (0.68, 0.95)
 TASKS = ("rows:2", "rows:4", "points:0.1")
 _MEDIAN = Jump(steps=1)
 _FEWEST = 1000  # added points that a quantile of 95 % needs at least
@@ -76,7 +76,7 @@ def trust_of(model: Checkpoint, truths: Sequence[ndarray], progress: Progress = 
     scores = np.concatenate([*_scores(plain, truths, progress)], axis=1)
     count = scores.shape[1]
     check(count >= _FEWEST, f"{count} added points are too few to compare: give more scans.")
-    ranks = [min(math.ceil((count + 1) * level), count) - 1 for level in LEVELS]
+    ranks = [min(math.ceil((count + 1) * level), count) - 1 for level in _LEVELS]
     first, second = (
         float(np.partition(one, rank)[rank]) for one, rank in zip(scores, ranks, strict=True)
     )
@@ -95,4 +95,4 @@ def _scores(model: Checkpoint, truths: Sequence[ndarray], progress: Progress) ->
             r = completed.images[0, 0]
             right = (r > 0) & (images[0, 0] > 0) & ~kept
             error = (r - images[0, 0]).abs()
-            yield (error / completed.error(*LEVELS)[:, 0])[:, right].numpy()
+            yield (error / completed.error(*_LEVELS)[:, 0])[:, right].numpy()

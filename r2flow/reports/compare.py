@@ -42,7 +42,7 @@ _NOTES = (
 )
 
 
-Groups = Mapping[str, Sequence[ComparedRun]]  # by label: runs that differ only in their seed
+_Groups = Mapping[str, Sequence[ComparedRun]]  # by label: runs that differ only in their seed
 
 
 def report_runs(folders: Sequence[Path], group: bool = False) -> Page:
@@ -53,7 +53,7 @@ def report_runs(folders: Sequence[Path], group: bool = False) -> Page:
     return compare_page(group_runs(runs) if group else {run.label: [run] for run in runs})
 
 
-def group_runs(runs: Sequence[ComparedRun]) -> Groups:
+def group_runs(runs: Sequence[ComparedRun]) -> _Groups:
     """Group runs that differ only in their seed, and in the seeds of their ancestors."""
     groups: dict[str, list[ComparedRun]] = {}
     for run in runs:
@@ -89,7 +89,7 @@ def configuration(config: ModelConfig) -> str:
     return json.dumps(settings, sort_keys=True, default=str)
 
 
-def _group_rows(groups: Groups) -> list[Row]:
+def _group_rows(groups: _Groups) -> list[Row]:
     """One row per group: means of the runs with a value, and the deviation of several."""
     rows = []
     for label, runs in groups.items():
@@ -122,7 +122,7 @@ def cell(row: Row, column: str) -> str:
     return text if spread is None else f"{text} ± {spread:.3g}"
 
 
-def compare_page(groups: Groups) -> Page:
+def compare_page(groups: _Groups) -> Page:
     """Build the page of a comparison: tables, curves, and which losses cannot be compared."""
     members = [(label, run) for label, runs in groups.items() for run in runs]
     rows = _group_rows(groups)

@@ -51,7 +51,7 @@ INTERPOLATIONS: dict[str, Rule] = {
     "linear": "linear",
     "linear, 1/r": "inverse",
 }
-Ways = Mapping[str, tuple[Checkpoint, Sampler]]  # models with samplers by name in tables
+_Ways = Mapping[str, tuple[Checkpoint, Sampler]]  # models with samplers by name in tables
 
 
 def report_completion(
@@ -136,7 +136,7 @@ def kept_rays(task: str, sensor: Sensor, number: int) -> ndarray:
 def completion_rows(
     truths: Sequence[ndarray],
     sensor: Sensor,
-    ways: Ways,
+    ways: _Ways,
     tasks: Sequence[str] = TASKS,
     num: int = 8,
     seed: int = 0,

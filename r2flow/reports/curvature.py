@@ -25,7 +25,7 @@ _COLUMNS = {
     "integral": "int s dt",
     "integral_normalised": "bend: int s dt / length^2",
 }
-Flows = Mapping[str, Straightness]  # by label
+_Flows = Mapping[str, Straightness]  # by label
 
 _TIME = "t  (0 noise, 1 data)"
 
@@ -87,7 +87,7 @@ def measure_paths(
     return Straightness(parts[0].t, s, squared_length, bends[order], trajectories[order])
 
 
-def _curvature_rows(flows: Flows) -> list[Row]:
+def _curvature_rows(flows: _Flows) -> list[Row]:
     """s(t) per checkpoint and time, mean over scans, unnormalised and over |d|^2."""
     rows = []
     for label, flow in flows.items():
@@ -107,7 +107,7 @@ def summary(label: str, flow: Straightness) -> Row:
     }
 
 
-def curvature_text(flows: Flows) -> list[Part]:
+def curvature_text(flows: _Flows) -> list[Part]:
     """Text: definition of s(t), and the table of flows."""
     first = next(iter(flows.values()))
     about = (
@@ -122,7 +122,7 @@ def curvature_text(flows: Flows) -> list[Part]:
     return [about, Table([summary(*flow) for flow in flows.items()], _COLUMNS)]
 
 
-def curvature_figure(flows: Flows) -> Figure:
+def curvature_figure(flows: _Flows) -> Figure:
     """Plot s(t), mean over scans, unnormalised and over |d|^2: one line per checkpoint."""
     plain = {label: (flow.t, flow.s.mean(0)) for label, flow in flows.items()}
     normalised = {label: (flow.t, flow.s_normalised.mean(0)) for label, flow in flows.items()}
@@ -133,7 +133,7 @@ def curvature_figure(flows: Flows) -> Figure:
     return lines_figure(plots, 2)
 
 
-def trajectories_figure(flows: Flows) -> Figure:
+def trajectories_figure(flows: _Flows) -> Figure:
     """Plot the most curved paths, one panel per checkpoint: the paper's figure 8 (b)."""
     figure = blank_figure(1 + 4.2 * len(flows), 4.2)
     panels = figure.subplots(1, len(flows), sharey=True, squeeze=False)[0]
@@ -147,7 +147,7 @@ def trajectories_figure(flows: Flows) -> Figure:
     return figure
 
 
-def curvature_page(flows: Flows, seed: int, device: str = "cpu") -> Page:
+def curvature_page(flows: _Flows, seed: int, device: str = "cpu") -> Page:
     """Build the page of the straightness of flows."""
     return Page(
         "curvature",

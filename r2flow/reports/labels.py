@@ -25,8 +25,8 @@ from r2flow.lidar.scan_files import points_beside, read_points, scan_ending
 from r2flow.metrics.labels import class_ious, confusion, mean_iou
 from r2flow.reports.tables import Table
 
-SAME = 0.01  # metres between a true point and the labelled one
-BINS = 10  # of probability
+_SAME = 0.01  # metres between a true point and the labelled one
+_BINS = 10  # of probability
 
 
 def label_tables(real: str, generated: str, ids: Sequence[str] = ()) -> list[Table]:
@@ -74,9 +74,9 @@ def label_tables(real: str, generated: str, ids: Sequence[str] = ()) -> list[Tab
 
 def _calibration(probability: ndarray, right: ndarray) -> Table:
     """How many of the labels are right, by tenths of their probability."""
-    part = (probability * BINS).astype(int).clip(0, BINS - 1)
-    count = np.bincount(part, minlength=BINS)
-    said, true = (np.bincount(part, values, BINS) for values in (probability, right))
+    part = (probability * _BINS).astype(int).clip(0, _BINS - 1)
+    count = np.bincount(part, minlength=_BINS)
+    said, true = (np.bincount(part, values, _BINS) for values in (probability, right))
     rows = [(said[i] / count[i], true[i] / count[i], int(count[i])) for i in np.flatnonzero(count)]
     return Table(rows, ("said", "right", "points"), "probability that a label is right")
 
@@ -103,7 +103,7 @@ def _matched(
     """True and found classes, and the found ones' probabilities, of the points of both."""
     xyz, true, _ = _points(truth, lists[0])
     others, labels, probability = _points(found, lists[1])
-    distance, number = cKDTree(others).query(xyz, distance_upper_bound=SAME)
+    distance, number = cKDTree(others).query(xyz, distance_upper_bound=_SAME)
     both = np.isfinite(distance)
     number = number[both]
     return true[both], labels[number], None if probability is None else probability[number]

@@ -20,9 +20,9 @@ from r2flow.lidar.point_cloud2 import CLOUD
 from r2flow.lidar.scan_files import Cloud
 from r2flow.store import Store
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
-Completion = Callable[[Cloud, int], Cloud]  # of a cloud and its number in the topic
+_Completion = Callable[[Cloud, int], Cloud]  # of a cloud and its number in the topic
 
 _SAMPLE = 1 << 20  # bytes at both ends of a file that identify it; an .mcap ends with its index
 
@@ -32,7 +32,7 @@ def complete_recording(
     out: Path,
     topic: str | None,
     everything: bool,
-    complete: Completion,
+    complete: _Completion,
     recipe: dict[str, Any],
 ) -> None:
     """Write a recording whose clouds of a topic are completed, with their headers; print counts.
@@ -79,7 +79,7 @@ def complete_recording(
 
 
 def _make_parts(
-    recording: Recording, topic: str, complete: Completion, store: Store, count: int
+    recording: Recording, topic: str, complete: _Completion, store: Store, count: int
 ) -> tuple[int, int]:
     """Complete the clouds that no part holds; the numbers of completed clouds and of new points."""
     done = added = 0
@@ -104,7 +104,7 @@ def _make_parts(
                     data = scan.replaced(cloud)
                 except InputError as error:
                     if wrong is None:
-                        log.warning(
+                        _log.warning(
                             "the cloud at %d stays as it is, as others may: %s",
                             message.recorded,
                             error,

@@ -41,8 +41,8 @@ from r2flow.reports.pages import Page
 from r2flow.reports.tables import Part, Row, Table, shown
 
 USUAL = ("euler", "midpoint", "adams3", "dopri5")  # measured first
-METHODS = (*dict.fromkeys((*USUAL, "exprb43", *SOLVERS)), f"{TORCHDIFFEQ}dopri5")
-TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5)  # of adaptive methods
+_METHODS = (*dict.fromkeys((*USUAL, "exprb43", *SOLVERS)), f"{TORCHDIFFEQ}dopri5")
+_TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5)  # of adaptive methods
 _REPEATS = 5  # maximum timed solutions per scan
 _PATIENCE = 0.5  # seconds after which timing stops
 _REFERENCE = 800  # evaluations of a reference solution, about
@@ -82,7 +82,7 @@ def report_solvers(
         samplers: Solvers; default: all built-in, without which `seconds` bound nothing.
         budgets: Evaluations of fixed-step solvers.
     """
-    methods = configurations(samplers or METHODS, budgets)
+    methods = configurations(samplers or _METHODS, budgets)
     subjects = problem_subjects(problems)
     if not methods or not (problems or model):
         raise InputError(
@@ -107,7 +107,7 @@ def report_solvers(
 
 
 def configurations(
-    methods: Sequence[str], budgets: Sequence[int], tolerances: Sequence[float] = TOLERANCES
+    methods: Sequence[str], budgets: Sequence[int], tolerances: Sequence[float] = _TOLERANCES
 ) -> dict[str, Row]:
     """Options of `solve` by label.
 
@@ -273,7 +273,7 @@ def _as_options(options: Row) -> str:
     return " ".join([f"--sampler {sampler}", *others])
 
 
-def reached(row: Row) -> float:
+def _reached(row: Row) -> float:
     """Error of a row, at least `floor`; infinite if a scan was not solved or x_0 has a smaller
     error.
     """
@@ -284,16 +284,16 @@ def reached(row: Row) -> float:
 
 def best_within(rows: Sequence[Row], budget: float) -> Row | None:
     """Row of smallest error within a number of evaluations; ties: fewest evaluations."""
-    within = [row for row in rows if row["evaluations"] <= budget and math.isfinite(reached(row))]
-    return min(within, key=lambda row: (reached(row), row["evaluations"]), default=None)
+    within = [row for row in rows if row["evaluations"] <= budget and math.isfinite(_reached(row))]
+    return min(within, key=lambda row: (_reached(row), row["evaluations"]), default=None)
 
 
 def cheapest(rows: Sequence[Row], metres: float) -> Row | None:
     """Row of fewest evaluations with a range error within a limit in metres (RMS, median over
     scans).
     """
-    within = [row for row in rows if math.isfinite(reached(row)) and row["range_rms_m"] <= metres]
-    return min(within, key=lambda row: (row["evaluations"], reached(row)), default=None)
+    within = [row for row in rows if math.isfinite(_reached(row)) and row["range_rms_m"] <= metres]
+    return min(within, key=lambda row: (row["evaluations"], _reached(row)), default=None)
 
 
 def solvers_page(
@@ -321,7 +321,7 @@ def solvers_page(
         scans = next(iter(groups.values()))[0]["scans"]
         for name, group in groups.items():
             best = [best_within(group, budget) for budget in budgets]
-            cells = [f"{row['method']} {shown(reached(row))}" if row else "none" for row in best]
+            cells = [f"{row['method']} {shown(_reached(row))}" if row else "none" for row in best]
             lines.append([name, *cells])
         text += [
             "## Exact problems",
@@ -359,7 +359,7 @@ def _plot(title: str, rows: Sequence[Row], x: str, y: str) -> Plot:
     """A line per method through the rows that solve the problem."""
     lines = {}
     for method, group in groupby(rows, itemgetter("method")):
-        solved = [row for row in group if math.isfinite(reached(row)) and math.isfinite(row[y])]
+        solved = [row for row in group if math.isfinite(_reached(row)) and math.isfinite(row[y])]
         solved.sort(key=itemgetter(x))
         if solved:
             errors = [max(row[y], _ROUNDING / 10) for row in solved]

@@ -15,8 +15,8 @@ from r2flow.base.errors import one_line
 
 Row = dict[str, Any]
 # Rows by key, with a heading for each key in order; or cells in order, with a heading for each.
-Rows = Sequence[Row] | Sequence[Sequence[Any]]
-Columns = Mapping[str, str] | Sequence[str]
+_Rows = Sequence[Row] | Sequence[Sequence[Any]]
+_Columns = Mapping[str, str] | Sequence[str]
 
 _NUMBER = re.compile(r"[-+]?\d|-?$|none$|inf$")  # how cells of a right-aligned column begin
 
@@ -24,15 +24,15 @@ _NUMBER = re.compile(r"[-+]?\d|-?$|none$|inf$")  # how cells of a right-aligned 
 class Table(NamedTuple):
     """A table of a page."""
 
-    rows: Rows
-    columns: Columns
+    rows: _Rows
+    columns: _Columns
     title: str = ""
 
 
 Part = str | Table  # of the text of a page
 
 
-def markdown(rows: Rows, columns: Columns, title: str = "") -> str:
+def markdown(rows: _Rows, columns: _Columns, title: str = "") -> str:
     """Format a table for Markdown, numbers with three digits."""
     lines = [[cell.replace("|", "\\|") for cell in line] for line in _as_text(rows, columns)]
     lines.insert(1, ["---"] * len(lines[0]))
@@ -40,7 +40,7 @@ def markdown(rows: Rows, columns: Columns, title: str = "") -> str:
     return "\n".join([*heading, *(f"| {' | '.join(line)} |" for line in lines)])
 
 
-def latex(rows: Rows, columns: Columns, title: str = "") -> str:
+def latex(rows: _Rows, columns: _Columns, title: str = "") -> str:
     """Format a table for LaTeX, of the package booktabs."""
     lines = [
         " & ".join(re.sub(r"([&%$#_{}])", r"\\\1", cell) for cell in line).replace("±", r"$\pm$")
@@ -53,7 +53,7 @@ def latex(rows: Rows, columns: Columns, title: str = "") -> str:
     return "\n".join([*parts, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
-def print_table(rows: Rows, columns: Columns, title: str = "") -> None:
+def print_table(rows: _Rows, columns: _Columns, title: str = "") -> None:
     """Print a table: numbers right-aligned, no heading line if all headings are "".
 
     A terminal's table has its width; elsewhere, as in a log, lines are as long as their cells.
@@ -105,7 +105,7 @@ def words(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{key} {shown(x)}" for key, x in values.items() if x is not None)
 
 
-def _as_text(rows: Rows, columns: Columns) -> list[list[str]]:
+def _as_text(rows: _Rows, columns: _Columns) -> list[list[str]]:
     """Headings and cells, line by line."""
     lines = [columns, *rows]
     if isinstance(columns, Mapping):

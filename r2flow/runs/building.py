@@ -30,7 +30,7 @@ from r2flow.runs.folder import check_run, read_config
 from r2flow.stages import STAGES
 from r2flow.stages.base import Stage
 
-log = logging.getLogger("r2flow")
+_log = logging.getLogger("r2flow")
 
 _EXPECTED_WARNINGS = (
     ".*does not have many workers.*",

@@ -26,7 +26,7 @@ from r2flow.base.config import key_of, override
 from r2flow.base.errors import InputError
 from r2flow.base.registry import Config, Options, did_you_mean, options_of
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 CONF = Path(str(files("r2flow.conf")))
 # Raised for a wrong config.
@@ -44,7 +44,7 @@ REGISTRIES = {
     "sensor": ("r2flow.lidar.sensors", "SENSORS", ()),
 }
 
-GROUPS = (*REGISTRIES, "encoding", "trainer", "callbacks", "experiment", "size")
+_GROUPS = (*REGISTRIES, "encoding", "trainer", "callbacks", "experiment", "size")
 
 
 def compose(
@@ -79,7 +79,7 @@ def compose(
 def _with_keys(keys: Options) -> list[str]:
     """The choices among a link's keys; its values become a config of Hydra's."""
     values = {key: dict(one) if isinstance(one, Mapping) else one for key, one in keys.items()}
-    named = [group for group in GROUPS if isinstance(values.get(group), str)]
+    named = [group for group in _GROUPS if isinstance(values.get(group), str)]
     chosen = [override(group, values.pop(group)) for group in named]
     if "name" in values.get("stage", ()):
         chosen.append(override("stage", values["stage"].pop("name")))
@@ -137,7 +137,7 @@ def add_choices() -> None:
             ConfigStore.instance().store(name, node, group=group)
 
 
-def with_choices(compose: Callable[[], T]) -> T:
+def with_choices(compose: Callable[[], _T]) -> _T:
     """The result of a composition; if it lacks a choice that a registry has, such as a plug-in's,
     of a second one.
 

@@ -20,7 +20,7 @@ from r2flow.model.parts import HYPER, NOTES
 from r2flow.model.paths import FOLDER, checkpoints_of, step_of
 from r2flow.model.tensor_files import read_checkpoint
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 CONFIG = "config.yaml"
 
@@ -156,6 +156,6 @@ def _readable(run: str | Path, needed: Sequence[str] = ()) -> Iterator[Path]:
             lacking = next((key for key in needed if key not in content), None)
             check(lacking is None, f"{path} cannot be resumed: it has no {lacking}.")
         except InputError as error:
-            log.warning("%s Passing it over.", error)
+            _log.warning("%s Passing it over.", error)
         else:
             yield path

@@ -13,16 +13,16 @@ from r2flow.lidar.sensors import Sensor
 from r2flow.simulator import REVISION, simulate
 from r2flow.store import FileStore
 
-KIND = "simulated"
+_KIND = "simulated"
 # npy is the range image itself.
-FORMATS = Registry("format", bin=".bin", pcd=".pcd", ply=".ply", npy=".npy")
+_FORMATS = Registry("format", bin=".bin", pcd=".pcd", ply=".ply", npy=".npy")
 
 
 class SimulatedFolder(FileStore):
     """The scans of a folder; scan i is a function of sensor, seed and i only.
 
     Args:
-        formats: Endings of the files of a scan, from `FORMATS`.
+        formats: Endings of the files of a scan, from `_FORMATS`.
         labels: Whether each scan has a SemanticKITTI .label file, a uint32 per point in the order
             of the points.
     """
@@ -38,14 +38,14 @@ class SimulatedFolder(FileStore):
         reading = {"sensor": sensor.described(), "reflectance_scale": 1.0}
         endings = [*formats, *(["label"] if labels else [])]
         super().__init__(
-            folder, KIND, {"simulator": REVISION, "seed": seed, "reading": reading}, endings
+            folder, _KIND, {"simulator": REVISION, "seed": seed, "reading": reading}, endings
         )
         self.sensor = sensor
         self.seed = seed
         self.formats = formats
         self.labels = labels
         for name in formats:
-            FORMATS[name]
+            _FORMATS[name]
         if labels and tuple(formats) == ("npy",):
             raise InputError(
                 "labels are those of points, and .npy is a range image without points; "

@@ -16,7 +16,7 @@ from r2flow.simulator.draws import cosine, exponential_quantiles, hypotenuse, ro
 from r2flow.simulator.lasers import Arrays, Rays, column_windows, row_windows
 
 # A field of all solids of a table, (P,) float32; a number for a single solid.
-Column = Any
+_Column = Any
 
 _NEAR = 0.05  # metres: minimum distance of intersections
 _LEAF = 3  # columns over which leaves pass all pulses or none
@@ -39,9 +39,9 @@ class Normal(NamedTuple):
     x: ndarray
     y: ndarray
     z: ndarray
-    along: Column = 0.0  # metres along the face from its centre; 0 without faces
-    end: Column = False  # whether the face is the front or back of a box
-    flat: Column = False  # whether the surface is a plane
+    along: _Column = 0.0  # metres along the face from its centre; 0 without faces
+    end: _Column = False  # whether the face is the front or back of a box
+    flat: _Column = False  # whether the surface is a plane
 
 
 class Frusta(
@@ -178,7 +178,7 @@ def _depths(k: ndarray, b: ndarray, w: ndarray, rng: Generator) -> ndarray:
     return quantiles[(scramble(k, cell, b, int(rng.integers(1 << 31))) >> 8) % len(quantiles)]
 
 
-def _into(solids: Frusta, k: ndarray, x: Column, y: Column) -> Arrays:
+def _into(solids: Frusta, k: ndarray, x: _Column, y: _Column) -> Arrays:
     """Points in the frames of the solids, and cos and sin of their yaw: (u, v, c, s), (N,) each."""
     c = cosine(solids.yaw)[k]
     s = sine(solids.yaw)[k]
@@ -234,7 +234,7 @@ def _upright(solids: Boxes | Cylinders, rays: Rays, spans: Arrays) -> Fragments:
     return take(Fragments(pixel, np.where(on_wall, near, over), k), hit)
 
 
-def _clip(near: Column, far: Column, direction: Any, room: Any) -> tuple[ndarray, ndarray]:
+def _clip(near: _Column, far: _Column, direction: Any, room: Any) -> tuple[ndarray, ndarray]:
     """The part of [near, far] with direction_i s <= room_i for all i; near >= far for none."""
     direction = np.stack(direction)
     room = np.stack(room)

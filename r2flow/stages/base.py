@@ -51,7 +51,7 @@ _BEYOND = 1.1  # largest value of a scan in model space, with some tolerance
 
 _FEW = 32  # held-out scans: a test of fewer is called chance
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 Batch = dict[str, Tensor]
 BackboneLike = str | nn.Module | Options | None
@@ -402,7 +402,7 @@ class Stage(L.LightningModule, NamedArguments):
         found = {f"test/{name}": value for name, value in self.panel.compute().items()}
         real = int(self.panel.counts[0, 0])
         if self.trainer.is_global_zero and real < _FEW:
-            log.warning("%d held-out scans are too few: distances to so few are chance", real)
+            _log.warning("%d held-out scans are too few: distances to so few are chance", real)
         self.log_dict(found, sync_dist=True)
 
     def configure_optimizers(self) -> Any:

@@ -18,7 +18,7 @@ from r2flow.flow.solvers.embedded import EmbeddedMethod
 from r2flow.flow.solvers.solution import Evaluations, Limits
 from r2flow.flow.solvers.step_size import StepController
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 # Lower tolerances cost evaluations without gaining accuracy (measured on the exact problems), since
 # rounding noise of the network dominates the error estimate.
@@ -35,7 +35,7 @@ def attainable(limits: Limits, dtype: torch.dtype) -> float:
     least = LEAST_TOLERANCE[dtype]
     if limits.tolerance < least and limits.tighter == 1:  # no second warning for the error estimate
         name = str(dtype).removeprefix("torch.")
-        log.warning(
+        _log.warning(
             "a tolerance of %g is below what %s can hold: %g is used.",
             limits.tolerance,
             name,

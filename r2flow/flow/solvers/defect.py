@@ -40,7 +40,7 @@ _GROSS = 10.0  # a bisected step that its error estimate accepts: in largest def
 _CROSSING = 0.2  # largest error of crossing a jump, in tolerances
 
 
-Velocities = dict[float, Tensor]  # of a scene, by share of its step
+_Velocities = dict[float, Tensor]  # of a scene, by share of its step
 
 
 class Tried(NamedTuple):
@@ -93,7 +93,7 @@ def inspect(control: StepController, tried: Tried, good: ndarray) -> ndarray:
         even = _probes(method, control.h[place] / control.length) or once
         planned[place] = even + control.remembered(place)
     held = good.copy()
-    found: dict[int, Velocities] = {}  # v at the probe that shows a change, by its time
+    found: dict[int, _Velocities] = {}  # v at the probe that shows a change, by its time
     for turn in count():
         due = [place for place in planned if held[place] and turn < len(planned[place])]
         places = np.array(due, int)
@@ -115,7 +115,7 @@ def inspect(control: StepController, tried: Tried, good: ndarray) -> ndarray:
     return held
 
 
-def _detrended(step: Tried, also: Velocities) -> tuple[Velocities, Tensor]:
+def _detrended(step: Tried, also: _Velocities) -> tuple[_Velocities, Tensor]:
     """A scene's velocities at its stages and `also` without their smooth trend, by increasing share
     of the step, and the trend: per element, the median slope over the gaps between stages.
     """
@@ -126,7 +126,7 @@ def _detrended(step: Tried, also: Velocities) -> tuple[Velocities, Tensor]:
     return {theta: value - theta * trend for theta, value in points}, trend
 
 
-def _oddest(step: Tried, also: Velocities) -> float:
+def _oddest(step: Tried, also: _Velocities) -> float:
     """The first share of a scene's step with at least a quarter of the largest change of v from its
     start; 0 if v is not finite.
 
@@ -137,7 +137,9 @@ def _oddest(step: Tried, also: Velocities) -> float:
     return list(points)[(changes >= changes.max() / 4).argmax()]
 
 
-def _locate(control: StepController, step: Tried, place: int, also: Velocities, held: bool) -> bool:
+def _locate(
+    control: StepController, step: Tried, place: int, also: _Velocities, held: bool
+) -> bool:
     """Bisect a scene's step until a jump is located or excluded; whether the step remains `held`.
 
     The bracket begins as the first pair of neighbouring values (stages and `also`) with at least

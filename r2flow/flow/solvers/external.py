@@ -12,7 +12,7 @@ from r2flow.base.registry import Config, Registry
 from r2flow.flow.solvers.adaptive import attainable
 from r2flow.flow.solvers.solution import Evaluations, Solution, Spent, finite
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 TORCHDIFFEQ = "torchdiffeq:"
 # Its Adams methods need equal steps, which it does not check: on other grids their order drops to
@@ -80,7 +80,7 @@ class TorchDiffEqMethod:
             # It asserts on underflowing steps, non-finite values.
             except (Spent, AssertionError) as error:
                 v.converged[i] = False
-                log.warning("%s%s gave up on scene %d: %s.", TORCHDIFFEQ, self.name, i, error)
+                _log.warning("%s%s gave up on scene %d: %s.", TORCHDIFFEQ, self.name, i, error)
         return v.solution(torch.cat([scene.last for scene in scenes]))
 
 

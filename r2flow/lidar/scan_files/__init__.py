@@ -51,7 +51,7 @@ ELSEWHERE = {
     (".lvx", ".lvx2", ".lvx3"): "is of a Livox, which has no beams; r2flow needs a spinning LiDAR",
     (".gz", ".bz2", ".xz", ".zst", ".zstd", ".zip", ".tar"): "is compressed: unpack it",
 }
-PLAIN = (".bin", ".pcd", ".ply", ".npy")  # that `write_points` writes
+_PLAIN = (".bin", ".pcd", ".ply", ".npy")  # that `write_points` writes
 _WRITERS: dict[str, Callable[[IO[bytes], Cloud], None]] = {
     ".pcd.bin": tables.write_rows,
     ".bin": tables.write_rows,
@@ -65,10 +65,10 @@ _WRITERS: dict[str, Callable[[IO[bytes], Cloud], None]] = {
     ".laz": partial(tables.write_las, compressed=True),
 }
 WRITTEN = tuple(_WRITERS)
-SCAN_ENDINGS = (*_ROWS, *_READERS)
+_SCAN_ENDINGS = (*_ROWS, *_READERS)
 LOOSE_ENDINGS = (".csv", ".txt", ".pth")  # also used for other files than scans
 FIRM_ENDINGS = tuple(
-    ending for ending in SCAN_ENDINGS if ending not in LOOSE_ENDINGS + TABLE_ENDINGS
+    ending for ending in _SCAN_ENDINGS if ending not in LOOSE_ENDINGS + TABLE_ENDINGS
 )
 
 FARTHEST_RAY = 400.0  # metres; no spinning LiDAR measures farther
@@ -118,7 +118,7 @@ def read_cloud(path: str | Path, columns: Sequence[str] | None = None) -> Cloud:
 def _read_cloud(path: Path, columns: Sequence[str] | None, state: tuple[int, ...]) -> Cloud:
     ending = scan_ending(path.name)
     if not ending and path.exists():
-        known = ", ".join(SCAN_ENDINGS)
+        known = ", ".join(_SCAN_ENDINGS)
         other = f"has no ending of a scan file; known: {known}. Convert or rename it"
         raise InputError(f"{path} {conversion_of(path) or other}.")
     raw = ending in _ROWS
@@ -244,8 +244,8 @@ def write_points(
     path = Path(path)
     ending = scan_ending(path.name)
     check(
-        ending in PLAIN and (ending != ".bin" or reflectance is not None),
-        f"{path}: scans are written as {', '.join(PLAIN)}; .bin only with a reflectance.",
+        ending in _PLAIN and (ending != ".bin" or reflectance is not None),
+        f"{path}: scans are written as {', '.join(_PLAIN)}; .bin only with a reflectance.",
     )
     fields = {**dict(zip("xyz", xyz.T, strict=True)), "intensity": reflectance, "ring": ring}
     with np.errstate(over="ignore"):  # float32 overflow is infinite
@@ -280,4 +280,4 @@ def write_cloud(path: Path, cloud: Cloud) -> None:
 
 def scan_ending(name: str) -> str:
     """The ending of a scan file's name in lower case, such as `.pcd.bin`; empty for others."""
-    return next((ending for ending in SCAN_ENDINGS if name.lower().endswith(ending)), "")
+    return next((ending for ending in _SCAN_ENDINGS if name.lower().endswith(ending)), "")

@@ -75,7 +75,7 @@ class Cloud:
         return replace(self, aliases=tuple(renamed(self.meanings, columns)))
 
     def place(self, role: str) -> int | None:
-        """The number of the field that is used of a role, a key of `points.ROLES`; None: none."""
+        """The number of the field that is used of a role, a key of `points._ROLES`; None: none."""
         places = places_of(self.meanings, role)
         filled = [place for place in places if self.columns[place].any()]
         return next(iter(filled or places), None)

@@ -17,35 +17,35 @@ from numpy import ndarray
 from r2flow.base.errors import InputError, check, quoted, require
 from r2flow.lidar.scan_files.cloud import Cloud
 
-PLY_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
-PLY_CODES = {  # NumPy's codes of PLY's types
+_PLY_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+_PLY_CODES = {  # NumPy's codes of PLY's types
     "char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I",
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I",
     "float": "f", "double": "d", "float32": "f", "float64": "d",
     "bool": "B",  # Open3D's
 }  # fmt: skip
-PLY_TYPES = {  # by NumPy's
+_PLY_TYPES = {  # by NumPy's
     "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint",
     "f4": "float", "f8": "double",
 }  # fmt: skip
-PCD_SIZES = "integers of 1, 2, 4, 8 bytes and floats of 4, 8"
+_PCD_SIZES = "integers of 1, 2, 4, 8 bytes and floats of 4, 8"
 
-PADDING = "_"  # PCL's name of bytes without meaning
-PICKLED = b"\x80"  # of protocol 2 and later
-UNPACK = (  # joblib's list of (N, 3) arrays, of which each becomes a file
+_PADDING = "_"  # PCL's name of bytes without meaning
+_PICKLED = b"\x80"  # of protocol 2 and later
+_UNPACK = (  # joblib's list of (N, 3) arrays, of which each becomes a file
     "python -c \"import joblib, numpy; [numpy.save(f'{i:06}.npy', x) for i, x in "
     "enumerate(joblib.load('samples.pcd'))]\", and give the folder."
 )
 
 
-def read_pcd(path: Path) -> Cloud:
+def _read_pcd(path: Path) -> Cloud:
     """All fields of a PCD of version 0.7, or older ones, whose fields may be called COLUMNS.
 
     VIEWPOINT is not applied: points are in the sensor's frame. A field of COUNT 0 stores nothing.
     """
     data = path.read_bytes()
-    if data.startswith(PICKLED):
-        raise InputError(f"it is a pickle, as LiDM's samples.pcd. If you trust it: {UNPACK}")
+    if data.startswith(_PICKLED):
+        raise InputError(f"it is a pickle, as LiDM's samples.pcd. If you trust it: {_UNPACK}")
     text, body = _split_header(data)
     header = {line.split()[0]: line.split()[1:] for line in text.splitlines() if line.strip()}
     declared = header.get("FIELDS") or header["COLUMNS"]
@@ -69,7 +69,7 @@ def read_pcd(path: Path) -> Cloud:
         columns = _decompressed(path, body, row, count)
     else:
         columns = _columns(body, row, count, encoding)
-    kept = [place for place, (name, *_) in enumerate(stored) if name != PADDING]
+    kept = [place for place, (name, *_) in enumerate(stored) if name != _PADDING]
     return Cloud(
         tuple(stored[place][0] for place in kept),
         tuple(columns[place] for place in kept),
@@ -97,7 +97,7 @@ def write_pcd(file: IO[bytes], cloud: Cloud) -> None:
     names = rows.dtype.names or ()
     kinds = [kind for kind, _ in fields]
     for name, kind in zip(names, kinds, strict=True):
-        _check_type(name, kind, "PCD", kind.kind in "iuf" and kind.itemsize <= 8, PCD_SIZES)
+        _check_type(name, kind, "PCD", kind.kind in "iuf" and kind.itemsize <= 8, _PCD_SIZES)
     viewpoint = " ".join(cloud.header or ["0", "0", "0", "1", "0", "0", "0"])
     file.write(
         f"VERSION 0.7\nFIELDS {' '.join(names)}\n"
@@ -110,7 +110,7 @@ def write_pcd(file: IO[bytes], cloud: Cloud) -> None:
     file.write(rows.tobytes())
 
 
-def read_ply(path: Path) -> Cloud:
+def _read_ply(path: Path) -> Cloud:
     """All properties of the element `vertex`, the first; later ones, as of a mesh, are ignored."""
     text, body = _split_header(path.read_bytes())
     head, vertex, *others = text.split("\nelement ")
@@ -120,8 +120,8 @@ def read_ply(path: Path) -> Cloud:
     if name != "vertex":
         raise InputError("its first element is not 'vertex', the points.")
     for kind, named in properties:
-        check(kind in PLY_CODES, f"its vertices have a property {quoted(named)}, a {kind}.")
-    codes = [PLY_ORDERS[encoding] + PLY_CODES[kind] for kind, _ in properties]
+        check(kind in _PLY_CODES, f"its vertices have a property {quoted(named)}, a {kind}.")
+    codes = [_PLY_ORDERS[encoding] + _PLY_CODES[kind] for kind, _ in properties]
     row = np.dtype([(str(number), code) for number, code in enumerate(codes)])
     names = tuple(name.strip() for _, name in properties)
     columns = tuple(_columns(body, row, int(count), encoding, last=not others))
@@ -134,7 +134,7 @@ def write_ply(file: IO[bytes], cloud: Cloud) -> None:
     rows = _little(cloud.array())
     properties = []
     for name, (kind, *_) in (rows.dtype.fields or {}).items():
-        held = PLY_TYPES.get(kind.str[1:])
+        held = _PLY_TYPES.get(kind.str[1:])
         _check_type(name, kind, "PLY", held, "integers of 1, 2, 4 bytes and floats of 4, 8")
         properties.append(f"property {held} {name}\n")
     comments = "".join(f"comment {line}\n" for line in cloud.header or ())
@@ -163,7 +163,7 @@ def _check_type(name: str, kind: np.dtype, form: str, held: object, holds: str) 
         raise InputError(f"the field {name!r} has a name that a {form} cannot hold: rename it.")
 
 
-READERS = {".pcd": read_pcd, ".ply": read_ply}
+READERS = {".pcd": _read_pcd, ".ply": _read_ply}
 
 
 def _split_header(data: bytes) -> tuple[str, bytes]:

@@ -23,12 +23,12 @@ ORIGIN = (0.0, 0.781, 1.860)
 TILT = (0.0157, -0.0006)
 AHEAD = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # from the vehicle's axes to r2flow's
 
-KNOTS = 5  # times of a frame at which the vehicle's pose is corrected
-VEHICLE = 3.0  # metres: nearer points are its own, whose elevations a small shift changes most
-FITTED = 8000  # points, evenly spread over the frame
-SCALES = np.radians(np.geomspace(1, 0.005, 8))  # of the residual, from coarse to fine
+_KNOTS = 5  # times of a frame at which the vehicle's pose is corrected
+_VEHICLE = 3.0  # metres: nearer points are its own, whose elevations a small shift changes most
+_FITTED = 8000  # points, evenly spread over the frame
+_SCALES = np.radians(np.geomspace(1, 0.005, 8))  # of the residual, from coarse to fine
 # Standard deviations of what is fitted: tilts, and the laser's position in metres.
-PRIOR = np.repeat([np.radians(1), np.radians(1), 0.3, 0.3, 0.3], KNOTS)
+_PRIOR = np.repeat([np.radians(1), np.radians(1), 0.3, 0.3, 0.3], _KNOTS)
 
 
 def read_frame(path: Path) -> Cloud:
@@ -106,8 +106,8 @@ def _json(path: Path) -> Any:
 def _aligned(xyz: ndarray, times: ndarray) -> ndarray:
     """Points in the laser's frame, so corrected that their elevations are those of the Pandar64.
 
-    The vehicle's tilt and the laser's position at `KNOTS` times, linear between them, are fitted to
-    the points around the vehicle by iterated least squares. A residual r is the elevation
+    The vehicle's tilt and the laser's position at `_KNOTS` times, linear between them, are fitted
+    to the points around the vehicle by iterated least squares. A residual r is the elevation
     of the nearest beam of the maker's table less the point's; it weighs 1 / (1 + (r / s)^2), with s
     from 1 to 0.005 degrees. Beams that are less than 2 s apart, which could be mistaken for each
     other, wait for a smaller s.
@@ -116,13 +116,13 @@ def _aligned(xyz: ndarray, times: ndarray) -> ndarray:
     between = (beams[1:] + beams[:-1]) / 2
     gaps = np.pad(np.diff(beams), 1, constant_values=np.inf)
     apart = np.minimum(gaps[1:], gaps[:-1])
-    knots = np.linspace(times.min(), times.max() + 1e-3, KNOTS)
+    knots = np.linspace(times.min(), times.max() + 1e-3, _KNOTS)
     near = np.maximum(1 - abs(times[:, None] - knots) / (knots[1] - knots[0]), 0)
     distance = np.linalg.norm(xyz, axis=1)
-    far = np.flatnonzero((distance > VEHICLE) & (distance < np.inf))
-    sample = far[np.linspace(0, len(far) - 1, min(FITTED, len(far))).astype(int)]
-    fitted = np.zeros(len(PRIOR))
-    for scale in SCALES:
+    far = np.flatnonzero((distance > _VEHICLE) & (distance < np.inf))
+    sample = far[np.linspace(0, len(far) - 1, min(_FITTED, len(far))).astype(int)]
+    fitted = np.zeros(len(_PRIOR))
+    for scale in _SCALES:
         x, y, z = _moved(xyz[sample], near[sample], fitted).T
         level = np.hypot(x, y).clip(1e-3)
         elevation = np.arctan2(z, level)
@@ -135,7 +135,7 @@ def _aligned(xyz: ndarray, times: ndarray) -> ndarray:
         each = [sin, -cos, z * cos / square, z * sin / square, -level / square]
         slopes = np.hstack([slope[:, None] * near[sample] for slope in each])
         weighted = slopes.T * weight
-        prior = (scale / PRIOR) ** 2
+        prior = (scale / _PRIOR) ** 2
         fitted += np.linalg.solve(
             weighted @ slopes + np.diag(prior), weighted @ residual - prior * fitted
         )
@@ -144,6 +144,6 @@ def _aligned(xyz: ndarray, times: ndarray) -> ndarray:
 
 def _moved(xyz: ndarray, near: ndarray, fitted: ndarray) -> ndarray:
     """Points after a shift and a turn by the tilts of their times."""
-    tilts, shifts = np.split(near @ fitted.reshape(5, KNOTS).T, [2], axis=1)
+    tilts, shifts = np.split(near @ fitted.reshape(5, _KNOTS).T, [2], axis=1)
     turn = Rotation.from_rotvec(np.pad(tilts, ((0, 0), (0, 1))))
     return turn.apply(xyz - shifts)

@@ -13,9 +13,9 @@ from numpy import ndarray
 
 from r2flow.base.errors import InputError, check
 
-LARGEST_TABLE = 1 << 28  # bytes unpacked; a frame of PandaSet has 8 MB
+_LARGEST_TABLE = 1 << 28  # bytes unpacked; a frame of PandaSet has 8 MB
 MOST_STEPS = 10_000  # of a pickle; a table has some hundreds
-TABLES = ("pandas", "numpy")  # packages whose names a table holds
+_TABLES = ("pandas", "numpy")  # packages whose names a table holds
 
 
 class _Named:
@@ -38,7 +38,7 @@ class _Named:
 
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> type[_Named]:
-        if module.partition(".")[0] not in TABLES and name != "slice":
+        if module.partition(".")[0] not in _TABLES and name != "slice":
             raise InputError(f"it names {module}.{name}, which is no part of a table. Is it safe?")
         return type(name, (_Named,), {})
 
@@ -56,8 +56,8 @@ def read_table(path: Path) -> dict[str, ndarray]:
     data = path.read_bytes()
     if data[:2] == b"\x1f\x8b":
         with gzip.open(io.BytesIO(data)) as packed:
-            data = packed.read(LARGEST_TABLE + 1)
-    check(len(data) <= LARGEST_TABLE, f"it is larger than {LARGEST_TABLE >> 20} MiB unpacked.")
+            data = packed.read(_LARGEST_TABLE + 1)
+    check(len(data) <= _LARGEST_TABLE, f"it is larger than {_LARGEST_TABLE >> 20} MiB unpacked.")
     # The unpickler allocates what a damaged step declares: a place in its memo, or a length.
     for number, (step, value, _) in enumerate(pickletools.genops(data)):
         place = int(value or 0) if step.name in ("PUT", "LONG_BINPUT") else 0

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 FARTHEST = 1e4
 NEAREST = 1e-3
 # The first name in the file is used: Ouster writes both an intensity and a calibrated reflectivity.
-ROLES: Mapping[str, tuple[str, ...]] = {
+_ROLES: Mapping[str, tuple[str, ...]] = {
     "x": ("x", "points_m_xyz:0", "points:0", "x1"),  # VeloView's, and Ouster's first return
     "y": ("y", "points_m_xyz:1", "points:1", "y1"),
     "z": ("z", "points_m_xyz:2", "points:2", "z1"),
@@ -40,7 +40,7 @@ _OTHERS = re.compile(
     "|ts|dt|t_.*|.*(label|class|instance|segment|index).*|id|range|distance|depth|azimuth|elevation"
     "|(row|col).*|returns?.*|.*return_?(number|type).*|confidence|v[xyz]|velocity.*"
 )
-_ROLE_OF = {alias: role for role, aliases in ROLES.items() for alias in aliases}
+_ROLE_OF = {alias: role for role, aliases in _ROLES.items() for alias in aliases}
 
 
 class NoPointsError(InputError):
@@ -86,7 +86,7 @@ def check_xyz(xyz: ndarray) -> None:
 
 
 def role_of(name: str) -> str | None:
-    """What a field of this name is, a key of `ROLES`; None if it is nothing of these.
+    """What a field of this name is, a key of `_ROLES`; None if it is nothing of these.
 
     Names are compared without case and without CloudCompare's prefix `scalar_`.
     """
@@ -94,9 +94,9 @@ def role_of(name: str) -> str | None:
 
 
 def places_of(names: Sequence[str], role: str) -> list[int]:
-    """The numbers of the fields of a role, a key of `ROLES`, in the order of its names there."""
+    """The numbers of the fields of a role, a key of `_ROLES`, in the order of its names there."""
     plain = [_plain(name) for name in names]
-    return [plain.index(alias) for alias in ROLES[role] if alias in plain]
+    return [plain.index(alias) for alias in _ROLES[role] if alias in plain]
 
 
 def _plain(name: str) -> str:
@@ -176,7 +176,7 @@ def column_points(names: Sequence[str], columns: Sequence[ndarray], raw: bool = 
         size = abs(axes).max(axis=0)
         finite = np.isfinite(size)
         if roles["reflectance"]:
-            reflectance = np.array(first_filled(roles["reflectance"]), dtype=np.float32)
+            reflectance = np.array(_first_filled(roles["reflectance"]), dtype=np.float32)
             finite &= np.isfinite(reflectance)
     _check_values(size, reflectance, finite, raw)
     kept = np.flatnonzero(finite & (size <= FARTHEST))
@@ -190,7 +190,7 @@ def column_points(names: Sequence[str], columns: Sequence[ndarray], raw: bool = 
     )
 
 
-def first_filled(columns: Sequence[ndarray]) -> ndarray:
+def _first_filled(columns: Sequence[ndarray]) -> ndarray:
     """The first of some columns that is not 0 throughout, as what was not measured is; else the
     first.
     """

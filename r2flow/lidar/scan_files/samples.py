@@ -56,7 +56,7 @@ def read_image(path: Path) -> ndarray:
     return np.concatenate([sample["depth"], sample["reflectance"]])
 
 
-def read_points(path: Path) -> Cloud:
+def _read_points(path: Path) -> Cloud:
     """The points of all pixels; those of rays without return are (0, 0, 0)."""
     sample = _read(path)
     columns = [*sample["xyz"], *sample["reflectance"]]
@@ -64,4 +64,4 @@ def read_points(path: Path) -> Cloud:
     return Cloud(names, tuple(column.ravel() for column in columns))
 
 
-READERS = {".pth": read_points}
+READERS = {".pth": _read_points}

@@ -20,7 +20,7 @@ from r2flow.lidar.scan_files.widths import fits_width, fitting_widths
 
 
 @dataclass(frozen=True)
-class TextForm:
+class _TextForm:
     """How the lines of a text file are written."""
 
     separator: str
@@ -28,12 +28,12 @@ class TextForm:
 
 
 _NUMBER = re.compile(r"(^|[;,\s])[-+]?(\.?\d|nan\b|inf\b)", re.IGNORECASE)
-LARGEST = 1 << 30  # bytes of the points of a compressed file
+_LARGEST = 1 << 30  # bytes of the points of a compressed file
 KEPT = 4  # files last read, which are looked at several times: for their sensor, their reflectance
 _KITTI = ("x", "y", "z", "reflectance")
 _NUSCENES = ("x", "y", "z", "intensity", "ring")
 _NPY = np.lib.format.MAGIC_PREFIX[:4]
-WIDEST = 32  # columns of points; a wider array is an image
+_WIDEST = 32  # columns of points; a wider array is an image
 _UNIT = re.compile(r"\s*[\[(](?!([cmk]m|ft)\b).*")  # other units than metres stay: not a known name
 
 
@@ -64,7 +64,7 @@ def _refuse_other_rows(path: Path, width: int) -> None:
     """Refuse a file if rows of another width, or of other floats, are the only ones that fit."""
     fitting = fitting_widths(np.fromfile(path, "<f4"))
     if len(fitting) == 1 and fitting != [width]:
-        names = ["x", "y", "z", "intensity", *"_" * WIDEST][: fitting[0]]
+        names = ["x", "y", "z", "intensity", *"_" * _WIDEST][: fitting[0]]
         raise InputError(
             f"it is made of rows of {fitting[0]} float32, not {width}: name all by --columns "
             f"{','.join(names)} (_ for what is not used)."
@@ -105,12 +105,12 @@ def _read_array(path: Path, state: tuple[int, ...]) -> ndarray:
     return array
 
 
-def read_npy(path: Path) -> Cloud:
+def _read_npy(path: Path) -> Cloud:
     """An array (N, 3) or wider, or with named fields."""
     array = read_array(path)
     if array.dtype.names is not None:
         return Cloud.of(array)
-    if array.ndim != 2 or array.shape[1] > WIDEST:
+    if array.ndim != 2 or array.shape[1] > _WIDEST:
         raise InputError(
             f"it holds an array {array.dtype} {array.shape}, not points: these are (N, 3) or "
             "(N, 4). Range images are floats (2, H, W), range in metres and reflectance, or "
@@ -119,7 +119,7 @@ def read_npy(path: Path) -> Cloud:
     return Cloud((), tuple(array.T), held=array.shape[1])
 
 
-def read_text(path: Path) -> Cloud:
+def _read_text(path: Path) -> Cloud:
     """A point per line, separated by commas, semicolons, tabs or spaces.
 
     Names stand in the first line, or in the comment before it. Columns without decimal points are
@@ -150,7 +150,7 @@ def read_text(path: Path) -> Cloud:
         # Slower; empty values, as of rays without return, and words become NaN.
         table = np.genfromtxt(rows, delimiter=separator, comments=None, ndmin=2)  # type: ignore[call-overload]
     width = table.shape[1]
-    form = TextForm(separator or " ", head[: len(head) - len(head.lstrip("#/ "))])
+    form = _TextForm(separator or " ", head[: len(head) - len(head.lstrip("#/ "))])
     if in_comment and (len(words) != width or not any(map(role_of, names))):
         return Cloud((), tuple(table.T), header=form, held=width)
     if len(words) < width and not np.isnan(table[:, -1]).all():
@@ -169,7 +169,7 @@ def _is_axis(name: str) -> bool:
     return role_of(name) in ("x", "y", "z")
 
 
-def read_arrow(path: Path) -> Cloud:
+def _read_arrow(path: Path) -> Cloud:
     """A Feather or Parquet table: Argoverse 2's lidar."""
     require(str(path), "formats", "pyarrow")
     from pyarrow import dataset
@@ -185,7 +185,7 @@ def read_arrow(path: Path) -> Cloud:
     return Cloud(tuple(table.column_names), columns, header=stored.schema)
 
 
-def read_las(path: Path) -> Cloud:
+def _read_las(path: Path) -> Cloud:
     """LAS and LAZ, read with laspy: scaled x, y, z, and all other fields."""
     compressed = path.suffix.lower() == ".laz"
     require(str(path), "formats", "laspy", *(["lazrs"] if compressed else []))
@@ -201,7 +201,7 @@ def read_las(path: Path) -> Cloud:
     backend = laspy.LazBackend.Lazrs if compressed else ()
     with laspy.open(io.BytesIO(content), laz_backend=backend, read_evlrs=False) as reader:
         header = reader.header
-        most = LARGEST if compressed else len(content)
+        most = _LARGEST if compressed else len(content)
         if header.point_count * header.point_format.size > most:
             raise InputError(
                 f"it is too small for the {header.point_count} points that it declares."
@@ -215,14 +215,14 @@ def read_las(path: Path) -> Cloud:
 
 
 READERS = {
-    ".npy": read_npy,
-    ".csv": read_text,
-    ".xyz": read_text,
-    ".txt": read_text,
-    ".feather": read_arrow,
-    ".parquet": read_arrow,
-    ".las": read_las,
-    ".laz": read_las,
+    ".npy": _read_npy,
+    ".csv": _read_text,
+    ".xyz": _read_text,
+    ".txt": _read_text,
+    ".feather": _read_arrow,
+    ".parquet": _read_arrow,
+    ".las": _read_las,
+    ".laz": _read_las,
 }
 
 
@@ -244,7 +244,7 @@ def column_names(width: int, columns: Sequence[str] | None) -> Sequence[str]:
 
 
 def write_las(file: IO[bytes], cloud: Cloud, compressed: bool) -> None:
-    """Write a cloud that `read_las` read, with its header; further fields are extra bytes."""
+    """Write a cloud that `_read_las` read, with its header; further fields are extra bytes."""
     import laspy
 
     rows = cloud.array()
@@ -284,7 +284,7 @@ def write_arrow(file: IO[bytes], cloud: Cloud, ending: str) -> None:
 def write_text(file: IO[bytes], cloud: Cloud) -> None:
     """Write a line per point, each number with as many digits as give it back, below the names.
 
-    Whole floats have a decimal point where `read_text` would take them for integers.
+    Whole floats have a decimal point where `_read_text` would take them for integers.
     """
     form = cloud.header
     if cloud.named:

@@ -18,7 +18,7 @@ _NETWORK = "model."  # prefix of the network's weights in the file; other entrie
 
 def _read_r2dm(content: Any, path: Path, averaged: bool = True) -> Published:
     """Load a published diffusion, sampled by 256 ancestral steps as in its scripts."""
-    config = published_config(content["cfg"])
+    config = _published_config(content["cfg"])
     weights = {}
     for name, value in content["ema_weights" if averaged else "weights"].items():
         if name.startswith(_NETWORK):
@@ -28,7 +28,7 @@ def _read_r2dm(content: Any, path: Path, averaged: bool = True) -> Published:
     return Published(config, weights, step, {"name": "ddpm", "steps": 256}, rings)
 
 
-def published_config(cfg: Options) -> Config:
+def _published_config(cfg: Options) -> Config:
     """Convert a published checkpoint's `cfg` (data, model, diffusion, training) to our config."""
     diffusion = cfg["diffusion"]
     if diffusion["timestep_type"] != "continuous" or not cfg["data"]["train_depth"]:

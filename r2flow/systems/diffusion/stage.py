@@ -16,14 +16,14 @@ from r2flow.stages.base import (
 from r2flow.systems.diffusion.generator import Diffusion
 from r2flow.systems.diffusion.process import noised
 
-ERRORS = Registry("error of an element", l2=F.mse_loss, l1=F.l1_loss, huber=F.smooth_l1_loss)
+_ERRORS = Registry("error of an element", l2=F.mse_loss, l1=F.l1_loss, huber=F.smooth_l1_loss)
 
 
 class LearnDiffusion(SingleLoss):
     """Regression of the prediction y(z_t, lambda_t) at t ~ Uniform[0, 1] (Kingma et al. 2021).
 
     Args:
-        loss: Name in `ERRORS`.
+        loss: Name in `_ERRORS`.
         min_snr: gamma of the weight min(SNR, gamma) on the error of expected data; None: the SNR,
             which weights the noise's error equally.
         paired: Whether a sample's error has its own weight; False: the batch's mean, as in R2DM's
@@ -49,7 +49,7 @@ class LearnDiffusion(SingleLoss):
             sensor,
             **options,
         )
-        self.error = ERRORS[loss]
+        self.error = _ERRORS[loss]
         self.min_snr = min_snr
         self.paired = paired
 

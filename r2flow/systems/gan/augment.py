@@ -43,29 +43,29 @@ class BatchDraws:
         return torch.tensor(np.stack(draws))
 
 
-Magnitudes = Mapping[str, Tensor]
+_Magnitudes = Mapping[str, Tensor]
 """Of each transformation, (B,), or (2, B) for rows and columns; its identity if it is left out."""
 
 
-class Transformation(NamedTuple):
+class _Transformation(NamedTuple):
     """How magnitudes are drawn for a batch, and that of the identity."""
 
     draw: Callable[[BatchDraws], Tensor]
     identity: float = 0.0
 
 
-_FLIP = Transformation(lambda source: (source.uniform() < 0.5).float())
+_FLIP = _Transformation(lambda source: (source.uniform() < 0.5).float())
 
 # In the order of drawing and application; shifts are relative to the size. The published hue and
 # saturation do not affect images of one or two channels.
 TRANSFORMATIONS = {
     "lr_flip": _FLIP,
     "ud_flip": _FLIP,
-    "int_trans": Transformation(lambda source: (source.uniform(2).mT - 0.5) / 4),
-    "iso_scale": Transformation(lambda source: torch.exp2(0.2 * source.normal()), 1.0),
-    "frac_trans": Transformation(lambda source: 0.125 * source.normal(2).mT),
-    "brightness": Transformation(lambda source: 0.2 * source.normal()),
-    "contrast": Transformation(lambda source: torch.exp2(0.5 * source.normal()), 1.0),
+    "int_trans": _Transformation(lambda source: (source.uniform(2).mT - 0.5) / 4),
+    "iso_scale": _Transformation(lambda source: torch.exp2(0.2 * source.normal()), 1.0),
+    "frac_trans": _Transformation(lambda source: 0.125 * source.normal(2).mT),
+    "brightness": _Transformation(lambda source: 0.2 * source.normal()),
+    "contrast": _Transformation(lambda source: torch.exp2(0.5 * source.normal()), 1.0),
     "luma_flip": _FLIP,
 }
 
@@ -117,7 +117,7 @@ class AdaptiveAugment(nn.Module):
         self.n_pred_cum.zero_()
         return sign
 
-    def draw(self, source: BatchDraws) -> Magnitudes:
+    def draw(self, source: BatchDraws) -> _Magnitudes:
         """Draw a batch's transformations; the number of draws does not depend on p."""
         p = float(self.p)
         magnitudes = {}
@@ -126,14 +126,14 @@ class AdaptiveAugment(nn.Module):
             magnitudes[name] = torch.where(source.uniform() < p, value, transformation.identity)
         return magnitudes
 
-    def forward(self, x: Tensor, by: Magnitudes) -> Tensor:
+    def forward(self, x: Tensor, by: _Magnitudes) -> Tensor:
         """Transform x (B, C, H, W) in at least float32; twice differentiable."""
         with torch.autocast(x.device.type, enabled=False):
             maps = (part.to(x.device) for part in affine(by, *x.shape[2:]))
             return _coloured(transformed(at_least_float32(x), *maps), by)
 
 
-def affine(by: Magnitudes, height: int, width: int) -> tuple[Tensor, Tensor]:
+def affine(by: _Magnitudes, height: int, width: int) -> tuple[Tensor, Tensor]:
     """Scale and shift of pixels about the image centre, (2, B) each, rows before columns.
 
     Only rows are scaled, since a scale of columns would open the ring.
@@ -187,7 +187,7 @@ def _row(lines: Tensor, index: Tensor) -> Tensor:
     return lines[nearest] * (index == nearest)[..., None].to(lines)
 
 
-def _coloured(x: Tensor, by: Magnitudes) -> Tensor:
+def _coloured(x: Tensor, by: _Magnitudes) -> Tensor:
     """Change the values of one channel; two are left alone, as in the published code."""
     if x.shape[1] != 1:
         return x

@@ -99,7 +99,7 @@ def _blurred(x: Tensor, sigma: float) -> Tensor:
     return Filter(window.tolist()).to(x.device)(x)
 
 
-DISCRIMINATORS = Registry(
+_DISCRIMINATORS = Registry(
     "discriminator", dcgan=dcgan.Discriminator, style_gan=style_discriminator.Discriminator
 )
 
@@ -158,7 +158,7 @@ class LearnGan(Stage):
         self.r1_every = r1_every
         self.last_r1: Tensor | None = None
         channels, *shape = self.space.shape
-        self.discriminator: nn.Module = DISCRIMINATORS.build(discriminator, shape, channels)
+        self.discriminator: nn.Module = _DISCRIMINATORS.build(discriminator, shape, channels)
         self.warmup = construct("stage.warmup", Warmup, warmup)
         self.augment = None
         if augment is not None:

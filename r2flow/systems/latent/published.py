@@ -21,7 +21,7 @@ from r2flow.lidar.sensors import build_sensor
 from r2flow.model.published import Format, Published
 from r2flow.systems.latent.autoencoder import UP
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _UNET = "model.diffusion_model."
 _AUTOENCODER = "first_stage_model."
@@ -182,7 +182,7 @@ def _notes(path: Path) -> Options:
 
 def _config(generator: Config, path: Path, notes: Options) -> Config:
     if not notes:
-        log.warning(
+        _log.warning(
             "%s has no config.yaml: assumed images of %d x %d, ranges of %g to %g m on a "
             "logarithmic scale, attention heads of %d channels.",
             path,
