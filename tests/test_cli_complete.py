@@ -265,6 +265,13 @@ def test_what_cannot_be_done_is_one_line(complete, tmp_path, image, options, mes
     assert_refused(complete(tmp_path / "one.npy", *options), message, tmp_path / "out")
 
 
+def test_two_fields_of_one_name_are_found_before_the_model_runs(complete, tmp_path):
+    twice = tmp_path / "twice.csv"
+    twice.write_text("x,y,z,_,_,stamp,stamp\n" + "1,2,3,0,1,2,3\n" * 9)
+    message = f"error: {twice}: it has two fields of the name stamp: rename one."
+    assert_refused(complete(twice), message, tmp_path / "out")
+
+
 def test_minus_one_is_no_return_at_any_share(complete, tmp_path):
     image = full_scan(tmp_path / "zeros.npy")
     image[:, ::4] = 0
@@ -462,6 +469,7 @@ def test_real_scans_of_other_sensors_are_completed(complete, run, shared, tmp_pa
     said = complete(file).said
     assert beams in said
     assert "1 scan written" in said
+    assert " as ." not in said  # another format
     used, kept = (
         int(number.replace(",", ""))
         for number in re.findall(r"(?:used|kept):[ a-z]* (\d[\d,]*)\b", said)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from r2flow.base.errors import InputError, warn_odd
+from r2flow.base.errors import InputError, naming, warn_odd
 from r2flow.data.described import Described, Spec, describe
 from r2flow.data.opening import open_scans
 from r2flow.data.options import PREPARED, SIMULATED
@@ -130,6 +130,8 @@ def _files(
 def _measured_points(path: Path, columns: Sequence[str] | None) -> Points:
     """The points of a file that a sensor measured, with all their fields."""
     cloud = read_cloud(path, columns)
+    with naming(path):
+        cloud.check_names()
     measured = cloud.measured()
     if len(measured) < len(cloud):
         warn_odd(path, "points that a completion added are left out", len(cloud) - len(measured))

@@ -88,7 +88,7 @@ def write_completed(
     if left:
         written.append(f"{counts.added / len(left) / job.num:,.0f} new points a scan")
     endings = {scan.ending: files[scan.name][0].suffix for scan in scans}
-    written += [f"{one} as {other}" for one, other in endings.items() if one != other]
+    written += [f"{one} as {other}" for one, other in endings.items() if not one.endswith(other)]
     return [*lines, ", ".join(written)]
 
 

@@ -96,7 +96,9 @@ def test_text_keeps_names_and_integers_that_floats_round(tmp_path: Path):
     (tmp_path / "a.csv").write_text("x,y,z,RING,t (ns)\n" + "".join(lines))
     write_cloud(tmp_path / "b.csv", read_cloud(tmp_path / "a.csv"))
     assert (tmp_path / "b.csv").read_text() == (tmp_path / "a.csv").read_text()
-    assert list(read_cloud(tmp_path / "b.csv").columns[4]) == list(stamps)
+    cloud = read_cloud(tmp_path / "b.csv")
+    assert list(cloud.columns[4]) == list(stamps)
+    assert [column.dtype for column in cloud.columns[3:]] == [np.int32, np.int64]
 
 
 def test_text_keeps_the_types_of_whole_numbers(tmp_path: Path):

@@ -49,16 +49,16 @@ class Cloud:
         """Names that say what the fields are."""
         return self.aliases or self.names
 
-    def array(self) -> ndarray:
-        """All fields as a structured array, (N,), with packed rows.
-
-        Raises:
-            InputError: Two fields have one name, so that one would be lost.
-        """
-        names = [f"_{place}" if name == "_" else name for place, name in enumerate(self.names)]
-        for name in names:
-            if names.count(name) > 1:
+    def check_names(self) -> None:
+        """Refuse two fields of one name, of which most formats would lose one."""
+        for name in self.names:
+            if name != "_" and self.names.count(name) > 1:
                 raise InputError(f"it has two fields of the name {name}: rename one.")
+
+    def array(self) -> ndarray:
+        """All fields as a structured array, (N,), with packed rows; names as `check_names`."""
+        self.check_names()
+        names = [f"_{place}" if name == "_" else name for place, name in enumerate(self.names)]
         kinds = [
             (name, column.dtype, column.shape[1:])
             for name, column in zip(names, self.columns, strict=True)

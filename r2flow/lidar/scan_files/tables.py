@@ -123,7 +123,7 @@ def _read_text(path: Path) -> Cloud:
     """A point per line, separated by commas, semicolons, tabs or spaces.
 
     Names stand in the first line, or in the comment before it. Columns without decimal points are
-    integers, but for coordinates.
+    integers of 4 bytes, or else 8, but for coordinates.
     """
     text = path.read_text("utf-8-sig", "replace").replace('"', "")
     lines = [line.strip(" \r") for line in text.split("\n") if line.strip()]
@@ -159,9 +159,11 @@ def _read_text(path: Path) -> Cloud:
     for place, (name, column) in enumerate(zip(names, columns, strict=False)):
         if not _is_axis(name) and (column % 1 == 0).all():
             with suppress(ValueError):  # a number has a decimal point
-                columns[place] = np.loadtxt(
+                whole = np.loadtxt(
                     rows, np.int64, delimiter=separator, comments=None, usecols=place, ndmin=1
                 )
+                short = whole.astype(np.int32)  # the one that a PointCloud2 can hold
+                columns[place] = short if (short == whole).all() else whole
     return Cloud(stored[:width], tuple(columns), tuple(names[:width]), header=form)
 
 
