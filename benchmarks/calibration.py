@@ -15,12 +15,14 @@ python benchmarks/calibration.py --fit densify,densify_small   # two minutes of 
 python benchmarks/calibration.py                           # the table, without and with calibration
 python benchmarks/calibration.py --drawn 8                 # truths between the least and greatest answer
 python benchmarks/calibration.py --kept                    # what --max-error keeps, by distance and class
+python benchmarks/calibration.py --own A B                 # B before and after `r2flow calibrate A`
 """
 
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
@@ -31,13 +33,16 @@ from benchmarks.real import FILES, TASKS, scans_of
 from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading, read_image, read_labelled_scan
 from r2flow.generators.calibration import Calibration, fitted
+from r2flow.lidar.estimation import estimate_sensor
 from r2flow.lidar.known import ray_states
 from r2flow.lidar.labels import COMMON, common_classes, labels_beside
-from r2flow.lidar.sensors import SENSORS, Sensor
+from r2flow.lidar.scan_files import read_points
+from r2flow.lidar.sensors import SENSORS, Sensor, write_sensor
 from r2flow.metrics.completion import spread_errors
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.model.completion import Completed, complete
 from r2flow.model.shipped import model_file
+from r2flow.reports.calibration import calibrate
 from r2flow.reports.completion import kept_rays
 from r2flow.reports.tables import print_table
 
@@ -79,7 +84,11 @@ class Case:
     @property
     def raw(self) -> "Case":
         """The case with the density as it was predicted."""
-        parts = tuple(replace(one, calibration=None) for one in self.completed.densities)
+        return self.by(None)
+
+    def by(self, calibration: Calibration | None) -> "Case":
+        """The case with another calibration."""
+        parts = tuple(replace(one, calibration=calibration) for one in self.completed.densities)
         return replace(self, completed=replace(self.completed, densities=parts))
 
     @property
@@ -191,6 +200,26 @@ def trusted(found: list[Case]) -> list[str]:
     return [*cells, f"{100 * ece:.1f}{'*' * bool(ece > 0.03)}"]
 
 
+def own_rows(name: str, folder: Path, judged: Path) -> Iterator[list[str]]:
+    """Rows of the scans of a folder, without and with the factors of another folder of scans."""
+    model = load_checkpoint(name)
+    paths = sorted(judged.iterdir())
+    sensor = estimate_sensor([read_points(path) for path in paths[:3]], "mine").sensor
+    with TemporaryDirectory() as place:
+        file = Path(place, "mine.yaml")
+        about = [read_points(path) for path in sorted(folder.iterdir())[:3]]
+        write_sensor(estimate_sensor(about, "mine").sensor, file, "")
+        factors = calibrate(model, str(folder), file).factors
+    scale = sensor.reflectance_scale
+    reading = Reading(sensor, reflectance_scale=scale or 1.0, reflectance=scale is not None)
+    flow = model.through(sensor)
+    own = replace(flow.generator.calibration, factors=factors)
+    for task in TASKS:
+        found = [Case.of(flow, read_image(path, reading), task) for path in paths]
+        yield [name, judged.parent.name, task, "", *trusted(found)]
+        yield [name, judged.parent.name, task, "own", *trusted([case.by(own) for case in found])]
+
+
 def classes_of(path: Path, reading: Reading) -> ndarray | None:
     """Semantic ids of a scan, (H, W); None without labels."""
     file = labels_beside(path)
@@ -206,6 +235,7 @@ def main() -> None:
     parser.add_argument("--sensors", default=",".join(FILES))
     parser.add_argument("--drawn", type=int, help="number of drawn answers")
     parser.add_argument("--kept", action="store_true")
+    parser.add_argument("--own", nargs=2, type=Path, help="scans to calibrate on, scans to judge")
     args = parser.parse_args()
     torch.set_num_threads(1)
     if args.fit:
@@ -216,6 +246,11 @@ def main() -> None:
         model = load_checkpoint(name)
         if args.kept:
             kept_table(name, model)
+            continue
+        if args.own:
+            for line in own_rows(name, *args.own):
+                lines.append(line)
+                print(*line, flush=True)
             continue
         for sensor in args.sensors.split(","):
             for task in TASKS:
