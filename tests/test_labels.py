@@ -1,6 +1,7 @@
 """Labels as channels: encoded, trained, drawn, written, painted and judged."""
 
 import math
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -239,6 +240,16 @@ def test_complete_writes_labels_and_probabilities_and_evaluate_judges_them(
         assert len(ids) == len(points.xyz) == len(stored["probability"])
     assert set(ids.tolist()) <= {0, *(group[0] for group in COMMON.values())}
     np.testing.assert_array_equal(points.xyz[: len(xyz)], xyz)
+    # Here each pixel is a point.
+    counts = Counter(common_classes(ids).astype(int).tolist())
+    shares = {
+        ["no class", *COMMON][number]: f"{count / len(ids):.0%}"
+        for number, count in counts.items()
+        if count / len(ids) >= 0.005
+    }
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith("classes of")]
+    printed = line.partition(": ")[2].split(", ")
+    assert dict(one.rsplit(" ", 1) for one in printed) == shares
     judged = r2flow("evaluate", truth, out, "--metrics", "miou")
     right = np.mean(common_classes(ids[: len(xyz)]) == classes)
     (line,) = [line for line in judged.said.splitlines() if line.startswith("right  ")]

@@ -7,6 +7,7 @@ from numpy import ndarray
 
 from r2flow.lidar.added import unknown_fields
 from r2flow.lidar.known import Ray
+from r2flow.lidar.labels import COMMON
 from r2flow.lidar.scan_files import WRITTEN
 from r2flow.lidar.sensors import Sensor
 from r2flow.reports.answer_rays import Answered
@@ -19,6 +20,7 @@ class Counts:
     rays: ndarray = field(default_factory=lambda: np.zeros(len(Ray), int))  # of each state
     outside: int = 0  # points
     added: int = 0
+    classes: ndarray = field(default_factory=lambda: np.zeros(1 + len(COMMON), int))  # pixels
     unknown: dict[str, None] = field(default_factory=dict)  # fields that added points lack
     beside: bool = False  # whether fields lie in files beside those of the points
 
@@ -29,7 +31,11 @@ class Counts:
                 f"{scan.name}: every ray of the image is measured, so nothing is added; see "
                 "--size, --from, --fill-gaps and --mask"
             )
-        returned = answered.completed.images[:, 0].numpy() > 0
+        images = answered.completed.images.numpy()
+        returned = images[:, 0] > 0
+        if images.shape[1] > 2:
+            found = images[:, 2][returned].astype(int)
+            self.classes += np.bincount(found, minlength=len(self.classes))
         self.added += int((returned & (known.state != Ray.RETURN)).sum())
         if not scan.image:
             self.rays += np.bincount(known.state.ravel(), minlength=len(Ray))
@@ -60,4 +66,9 @@ class Counts:
                 f"used: the nearest point in each pixel of {rows}x{columns}; {self.outside:,} "
                 f"outside {sensor.min_range:g}-{sensor.max_range:g} m left out"
             )
+        if (total := self.classes.sum()) > 0:
+            named = zip(self.classes / total, ["no class", *COMMON], strict=True)
+            largest = sorted(named, reverse=True)
+            told = ", ".join(f"{name} {share:.0%}" for share, name in largest if share >= 0.005)
+            lines.append(f"classes of the pixels with a return: {told}")
         return lines
