@@ -278,16 +278,6 @@ def quick_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     draw_quickly(monkeypatch)
 
 
-@pytest.fixture
-def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Larger cells on the ground, for tests to which their size is nothing: millions of them take
-    time.
-    """
-    monkeypatch.setattr("r2flow.metrics.lidm.FINE", 0.5)
-    monkeypatch.setattr("r2flow.metrics.lidm.JSDLiDM.width", 200**2)
-    monkeypatch.setattr("r2flow.metrics.lidm.COARSE", 5)
-
-
 def ground(sensor: Sensor, above: float = 0.0) -> np.ndarray:
     """An image of the ground 1.73 m below, and of another range above it."""
     e = sensor.rays()[0].numpy()

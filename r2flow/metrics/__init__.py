@@ -3,7 +3,8 @@
 `METRICS[name](sensor=...)` builds a metric. Importing this module does not import torch.
 
 Not implemented: LiDARGen's JSD and MMD, which keep returns up to 70 m (scans are masked to 63 m
-here), and UltraLiDAR's, which compare voxel centres of real scans with points of generated scans.
+here), LiDM's, whose "MMD" is a minimum matching distance, and UltraLiDAR's, which compare voxel
+centres of real scans with points of generated scans.
 """
 
 from __future__ import annotations
@@ -30,8 +31,6 @@ METRICS: Registry[Callable[..., ScanMetric]] = Registry(
     "metric",
     jsd=lazy("r2flow.metrics.jsd_mmd:JSD"),
     mmd=lazy("r2flow.metrics.jsd_mmd:MMD"),
-    jsd_lidm=lazy("r2flow.metrics.lidm:JSDLiDM"),
-    mmd_lidm=lazy("r2flow.metrics.lidm:MMDLiDM"),
     panel=lazy("r2flow.metrics.panel:Panel"),
     things=lazy("r2flow.metrics.things:Things"),
 )

@@ -18,7 +18,6 @@ from r2flow.metrics.scans import Scans
 from tests.metrics.conftest import SMALL, one_of_each_class, scans_of
 
 REAL, GENERATED = 12, 9
-pytestmark = pytest.mark.usefixtures("coarse")
 
 
 @pytest.fixture(params=one_of_each_class())
