@@ -322,7 +322,7 @@ def test_metrics_and_networks_that_a_user_has_added_are_measured(
 @pytest.mark.parametrize("ranks", [2, 3])
 def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path, ranks):
     def run(out: Path, *launcher: str) -> dict[str, float]:
-        metrics = "jsd,mmd,frechet_handcrafted,manifold_handcrafted"
+        metrics = "jsd,mmd,frechet_handcrafted,kid_handcrafted"
         options = ("--metrics", metrics, "--size", "8x64", "--batch-size", "2", "--workers", "0")
         command = [
             *launcher,

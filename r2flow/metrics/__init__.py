@@ -37,11 +37,10 @@ METRICS: Registry[Callable[..., ScanMetric]] = Registry(
 
 
 def add_network(name: str) -> None:
-    """Register a network's metrics: Frechet distance, kernel distance, precision and recall."""
+    """Register a network's metrics: Frechet distance and kernel distance."""
     frechet = FIELD_NAMES.get(name, f"frechet_{name}")
     METRICS.add(frechet, lazy("r2flow.metrics.features:FrechetDistance", name))
     METRICS.add(f"kid_{name}", lazy("r2flow.metrics.features:KernelDistance", name))
-    METRICS.add(f"manifold_{name}", lazy("r2flow.metrics.features:Manifold", name))
 
 
 for _network in EXTRACTORS:

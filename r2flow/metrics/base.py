@@ -215,23 +215,18 @@ class StoredMetric(ScanMetric):
         stored = (self.real_rows, self.generated_rows)[side]
         stored.append(rows.flatten().float().to(self.device))
 
-    @property
-    def labels(self) -> list[str]:
-        """Names of the values."""
-        return [self.name]
-
     @abstractmethod
-    def values(self, real: Tensor, generated: Tensor) -> list[float]:
-        """Compute the values from rows (N, D) and (M, D), float32, which must not be changed."""
+    def value(self, real: Tensor, generated: Tensor) -> float:
+        """Compute the value from rows (N, D) and (M, D), float32, which must not be changed."""
 
     def figures(self) -> Figures:
         real, generated = self.counts[:, 1].tolist()
         if min(real, generated) < self.fewest:
             self.remarks.append(f"{self.name} needs {self.fewest} or more scans of each set.")
-            return dict.fromkeys(self.labels, float("nan"))
+            return {self.name: float("nan")}
         rows = _joined(self.real_rows).cpu().view(real, -1)
         others = _joined(self.generated_rows).cpu().view(generated, -1)
-        return dict(zip(self.labels, self.values(rows, others), strict=True))
+        return {self.name: self.value(rows, others)}
 
 
 def _joined(rows: list[Tensor] | Tensor) -> Tensor:

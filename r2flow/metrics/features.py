@@ -1,4 +1,4 @@
-"""Metrics on a network's features of scans: distances, precision and recall."""
+"""Distances between features of scans."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -8,14 +8,12 @@ import torch
 from torch import Tensor
 
 from r2flow.metrics import FIELD_NAMES
-from r2flow.metrics.base import BLOCK, Protocol, StoredMetric, blocks
+from r2flow.metrics.base import Protocol, StoredMetric
 from r2flow.metrics.extractors import EXTRACTORS
 from r2flow.metrics.extractors.base import Extractor, weights_hash
-from r2flow.metrics.jsd_mmd import squared_distances, squared_mmd
+from r2flow.metrics.jsd_mmd import squared_mmd
 from r2flow.metrics.scans import Scans
 
-NEIGHBOURS = 5  # k of `Manifold`
-_TIE = 1e-9  # relative tolerance: neighbours at exactly the radius count as inside
 _FEW = (
     "fewer scans than features on a side: its covariance has no full rank, and the distance is too "
     "large; compare it only with distances of as many scans."
@@ -123,10 +121,10 @@ class FrechetDistance(_FeatureMetric):
     settings: ClassVar = {"covariance": "unbiased, n - 1"}
     biased = True
 
-    def values(self, real: Tensor, generated: Tensor) -> list[float]:
+    def value(self, real: Tensor, generated: Tensor) -> float:
         if min(len(real), len(generated)) <= self.extractor.dim:
             self.remarks.append(_FEW)
-        return [_frechet_distance(*gaussian(real), *gaussian(generated))]
+        return _frechet_distance(*gaussian(real), *gaussian(generated))
 
 
 class KernelDistance(_FeatureMetric):
@@ -142,56 +140,10 @@ class KernelDistance(_FeatureMetric):
     settings: ClassVar = {"kernel": "(a b / D + 1)^3", "estimate": "unbiased, all pairs"}
     biased = False
 
-    def values(self, real: Tensor, generated: Tensor) -> list[float]:
-        return [squared_mmd(real, generated, _cubic_kernel, biased=False)]
+    def value(self, real: Tensor, generated: Tensor) -> float:
+        return squared_mmd(real, generated, _cubic_kernel, biased=False)
 
 
 def _cubic_kernel(a: Tensor, b: Tensor) -> Tensor:
     z = a @ b.T / a.shape[1]
     return z * (3 + z * (3 + z))  # (z + 1)^3 - 1
-
-
-class Manifold(_FeatureMetric):
-    """Precision, recall, density and coverage of generated scans in a network's feature space.
-
-    A set is represented by balls around its scans, with the distance to the k-th nearest neighbour
-    in the set as radius. Kynkaanniemi et al. (2019): precision is the share of generated scans
-    inside a real ball, recall the share of real scans inside a generated ball. Naeem et al. (2020):
-    density is the mean number of real balls that contain a generated scan, over k (it may exceed 1
-    and is robust to outliers), coverage the share of real balls that contain a generated scan.
-
-    The values are named `precision_<network>` and so on.
-    """
-
-    kind = "manifold"
-    settings: ClassVar = {"neighbours": NEIGHBOURS, "distance": "Euclidean"}
-    fewest = NEIGHBOURS + 1
-
-    @property
-    def labels(self) -> list[str]:
-        network = self.name.removeprefix("manifold_")
-        return [f"{name}_{network}" for name in ("precision", "recall", "density", "coverage")]
-
-    def values(self, real: Tensor, generated: Tensor) -> list[float]:
-        middle = real[:BLOCK].double().mean(0)  # subtracted for accuracy far from 0
-        real = real.double() - middle
-        generated = generated.double() - middle
-        real_radii = _squared_radii(real) * (1 + _TIE)
-        generated_radii = _squared_radii(generated) * (1 + _TIE)
-        balls = torch.zeros(len(generated), dtype=torch.float64)
-        recalled = []
-        covered = []
-        for i, x in blocks(real):
-            d = squared_distances(x, generated)
-            inside = d <= real_radii[i, None]
-            balls += inside.sum(0)
-            covered.append(inside.any(1))
-            recalled.append((d <= generated_radii).any(1))
-        scores = (balls > 0, torch.cat(recalled), balls / NEIGHBOURS, torch.cat(covered))
-        return [float(score.double().mean()) for score in scores]
-
-
-def _squared_radii(rows: Tensor) -> Tensor:
-    """Squared distance of each row to its k-th nearest neighbour, (N,); it is its own first."""
-    nearest = [squared_distances(x, rows).kthvalue(NEIGHBOURS + 1).values for _, x in blocks(rows)]
-    return torch.cat(nearest)

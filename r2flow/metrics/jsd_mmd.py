@@ -76,8 +76,8 @@ class MMD(StoredMetric):
     def rows(self, scans: Scans) -> Tensor:
         return _histograms(scans)
 
-    def values(self, real: Tensor, generated: Tensor) -> list[float]:
-        return [max(squared_mmd(real, generated, _gaussian_kernel, biased=True), 0.0)]
+    def value(self, real: Tensor, generated: Tensor) -> float:
+        return max(squared_mmd(real, generated, _gaussian_kernel, biased=True), 0.0)
 
 
 def _gaussian_kernel(a: Tensor, b: Tensor) -> Tensor:

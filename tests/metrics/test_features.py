@@ -1,4 +1,4 @@
-"""Precision, recall, density, coverage and the kernel distance of features."""
+"""The kernel distance of features."""
 
 from itertools import combinations, product
 
@@ -6,66 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from r2flow.metrics import features
-from r2flow.metrics.features import KernelDistance, Manifold
-from r2flow.metrics.jsd_mmd import squared_distances
+from r2flow.metrics.features import KernelDistance
 from tests.metrics.conftest import Summary, given
 
 
-def figures(real, generated, metric=Manifold):
-    return list(
-        given(metric(Summary()), *(torch.as_tensor(x).float() for x in (real, generated))).values()
-    )
-
-
 def kernel_distance(real, generated):
-    return figures(real, generated, KernelDistance)[0]
-
-
-def brute_force(real, generated, k):
-    """The papers' definitions, one pair after the other."""
-
-    def radius(rows, i):
-        return np.sort(np.linalg.norm(np.delete(rows, i, 0) - rows[i], axis=1))[k - 1]
-
-    r_real, r_generated = (
-        [radius(rows, i) for i in range(len(rows))] for rows in (real, generated)
-    )
-    inside = [[np.linalg.norm(g - r) <= r_real[i] for i, r in enumerate(real)] for g in generated]
-    recalled = [
-        any(np.linalg.norm(g - r) <= r_generated[j] for j, g in enumerate(generated)) for r in real
-    ]
-    return [
-        np.any(inside, 1).mean(),
-        np.mean(recalled),
-        np.sum(inside) / k / len(generated),
-        np.any(inside, 0).mean(),
-    ]
-
-
-@pytest.mark.parametrize(("k", "block"), [(1, 7), (3, 2000), (5, 10)])
-def test_as_pair_by_pair(k, block, monkeypatch):
-    monkeypatch.setattr("r2flow.metrics.base.BLOCK", block)
-    monkeypatch.setattr(features, "NEIGHBOURS", k)
-    draw = np.random.default_rng(k)
-    real, generated = (
-        draw.normal(size=(31, 3)).astype("f4"),
-        draw.normal(0.7, 0.6, size=(24, 3)).astype("f4"),
-    )
-    found = figures(real, generated)
-    assert found == pytest.approx(
-        brute_force(real.astype(float), generated.astype(float), k), abs=1e-12
-    )
-    assert 0 < found[1] < found[0] < 1
-
-
-def test_repeated_scans_lie_on_each_other_however_far_from_zero():
-    rows = np.repeat(1e3 + np.random.default_rng(0).normal(size=(10, 301)), 6, axis=0)
-    # Every ball has the radius 0, and holds the six that are one: density 6 / 5.
-    assert figures(rows, rows) == pytest.approx([1, 1, 6 / 5, 1])
-    x = torch.from_numpy(rows)
-    # where two ways to add up are rounded differently
-    assert not squared_distances(x, x).diagonal().any()
+    rows = (torch.as_tensor(x).float() for x in (real, generated))
+    (found,) = given(KernelDistance(Summary()), *rows).values()
+    return found
 
 
 def test_the_kernel_distance_of_two_gaussians_is_that_of_their_moments():

@@ -102,7 +102,7 @@ def test_a_figure_that_does_not_exist_comes_with_a_remark(build, sets, case):
 def test_equal_sets_are_at_no_distance(build, sets):
     metric = give(build(), dict.fromkeys(SIDES, sets["real"]))
     values = list(metric.compute().values())
-    if metric.name.startswith(("kid", "manifold", "things")):
+    if metric.name.startswith(("kid", "things")):
         assert all(map(math.isfinite, values))
     else:
         assert values == pytest.approx([0] * len(values), abs=1e-9)
@@ -139,7 +139,7 @@ def test_reset_copies_and_pickles(build, sets):
 
 
 def test_in_a_collection_every_metric_has_its_own_figures(summary, sets):
-    names = [*one_of_each_class(), "frd", "manifold_rangenet53"]
+    names = [*one_of_each_class(), "frd", "kid_rangenet53"]
     collection = MetricCollection({name: METRICS[name]() for name in names})
     assert collection(sets["real"], real=True) == {}  # a batch has no distance of its own
     collection.reset()
@@ -158,10 +158,7 @@ def test_a_network_runs_once_for_all_metrics_of_it(summary, sets, monkeypatch):
     monkeypatch.setattr(
         type(summary), "features", lambda self, scans: ran.append(self) or features(self, scans)
     )
-    metrics = [
-        METRICS[name]()
-        for name in ("frechet_handcrafted", "manifold_handcrafted", "kid_handcrafted", "frid")
-    ]
+    metrics = [METRICS[name]() for name in ("frechet_handcrafted", "kid_handcrafted", "frid")]
     for metric in metrics:
         metric.update(sets["real"], real=True)
     assert [network.name for network in ran] == ["handcrafted", "rangenet21"]

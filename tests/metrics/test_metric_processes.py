@@ -13,7 +13,7 @@ from r2flow.lidar.sensors import SENSORS
 from r2flow.metrics import METRICS
 from r2flow.metrics.base import StoredMetric
 from r2flow.metrics.extractors import EXTRACTORS
-from r2flow.metrics.features import FrechetDistance, Manifold
+from r2flow.metrics.features import FrechetDistance, KernelDistance
 from tests.metrics.conftest import scans_of
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
@@ -31,7 +31,7 @@ def measure(rank, ranks):
     """
     network, found = EXTRACTORS["handcrafted"].trained(), []
     metrics = [METRICS[name](sensor=SENSOR) for name in ("jsd", "mmd")]
-    metrics += [FrechetDistance(network, sensor=SENSOR), Manifold(network, sensor=SENSOR)]
+    metrics += [FrechetDistance(network, sensor=SENSOR), KernelDistance(network, sensor=SENSOR)]
     for metric in metrics:
         for seed in (1, 4):
             for real, scans in ((True, images(seed, 14)), (False, images(seed + 1, 11))):
