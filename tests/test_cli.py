@@ -248,24 +248,3 @@ def test_interpolate_writes_every_frame(r2flow, run, tmp_path):
     assert r2flow("interpolate", run, *files, "-o", out, "--frames", 3, "--steps", 5).said
     rows = json.loads((out / "interpolation.json").read_text())["rows"]
     assert [row["evaluations"] for row in rows] == [10, 5, 10]  # of adams3, one a step
-
-
-def test_a_sector_and_rows_are_all_that_is_written(r2flow, run, tmp_path):
-    part = tmp_path / "part"
-    said = r2flow(
-        "sample", run, "--num", 1, "--steps", 2, "--sector", "-45,45", "--rows", "0-2", "-o", part
-    ).said
-    # 11.25 degrees are 2 columns, and the network's unit is 8.
-    assert (
-        "generating rows 0-3, columns 16-47, for rows 0-2, columns 24-39: 25% of the image" in said
-    )
-    image = np.load(part / "000000.npy")
-    assert image.shape == (2, 8, 64)
-    for judged in (("evaluate", part, "simulated:0"), ("evaluate", "simulated:0", part)):
-        assert f"{part} holds a part of each scan alone" in r2flow(*judged).refusal
-    inside = np.zeros((8, 64), bool)
-    inside[:3, 24:40] = True
-    assert (image[0][inside] > 0).any()
-    assert (image[:, ~inside] == 0).all()
-    xyz = read_points(part / "000000.ply").xyz
-    assert (np.abs(np.arctan2(xyz[:, 1], xyz[:, 0])) < np.pi / 4).all()

@@ -20,11 +20,10 @@ from r2flow.base.progress import Bar
 from r2flow.evaluation.sets import sampled_set
 from r2flow.generators import Generator, Sampler, build_generator
 from r2flow.lidar.encoding import Encoding, ModelSpace
-from r2flow.lidar.region import region
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import completing
 from r2flow.model.inversion import interpolate_scans, invert, round_trip, slerp
-from r2flow.model.sampling import draw, evaluated_region, sample
+from r2flow.model.sampling import draw, sample
 from r2flow.reports.outputs import write_samples
 from r2flow.runs.composing import compose
 from r2flow.samplers import build_sampler
@@ -187,23 +186,6 @@ def test_frames_lie_between_the_scans():
     assert arrived == [2, 3, 4, 5]
 
 
-def test_a_region_is_generated_from_the_whole_image_s_noise():
-    checkpoint = network()
-    wanted = region(SENSOR.shape, (-30, 40), (2, 5))
-    seen = evaluated_region(checkpoint.generator, wanted)
-    (drawn,) = sample(checkpoint, 2, sampler="euler", steps=3, batch_size=2, seed=9, region=wanted)
-    shapes = []
-    part = checkpoint.generator.part(seen).backbone
-    x = seen.crop(Draws(9, range(2)).start((2, 8, 64)))
-    for step in range(3):  # three Euler steps, written out
-        shapes.append(tuple(x.shape[2:]))
-        x = x + part(torch.tensor(step / 3), x) / 3
-    assert set(shapes) == {(seen.height, seen.width)}
-    whole = seen.place(checkpoint.encoding.decode(x))
-    torch.testing.assert_close(wanted.crop(drawn.images), wanted.crop(whole), rtol=1e-5, atol=1e-4)
-    assert (drawn.images == wanted.place(wanted.crop(drawn.images))).all()
-
-
 class Lost(GaussianFlow):
     def forward(self, t, x):
         lost = torch.arange(len(x)).view(-1, 1, 1, 1) == 1
@@ -280,17 +262,6 @@ def test_a_stopped_call_goes_on_and_other_samples_are_replaced_or_kept(tmp_path,
     (tmp_path / "manifest.json").unlink()
     with pytest.raises(InputError, match=r"\.(npy|ply)\) and no manifest.json"):
         write(3)
-
-
-def test_what_makes_whole_images_alone_makes_the_region_that_is_all():
-    gan = build_generator(
-        compose(["experiment=vanilla_gan", "size=small", "generator.base_channels=4", *SIZE])
-    ).eval()
-    (part,) = sample(gan, 1, region=region((16, 32)))
-    (whole,) = sample(gan, 1)
-    assert torch.equal(part.images, whole.images)
-    with pytest.raises(InputError, match="whole images"):
-        next(sample(gan, 1, region=region((16, 32), rows=(0, 7))))
 
 
 def test_numeric_times_decide_the_number_of_steps():

@@ -44,7 +44,6 @@ info ~nouser/run # Write the path in full
 info --add rangenet53 file.txt
 sample run -o out --sampler dopri5 --steps 50 # steps
 sample run -o out --seed 18446744073709551616 # 18446744073709551615
-sample run -o out --sector 10,10.0000001 # narrower than a column
 sample run -o out --format npy, # --format 'npy,' cannot
 sample run -o out --grid power:10 --steps 64 # 64 steps on power:10
 sample '' -o out # an argument is empty

@@ -1,7 +1,6 @@
 """Base class of backbones: fields on images of one shape with stored rays, for one time or two."""
 
-import copy
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -22,14 +21,12 @@ class Backbone(ExactBuffers):
     A subclass implements `velocity` and passes the options below on as `**common`; layers with
     times as input are `ExactLinear`, since times stay float32. A class declares its capabilities:
 
-    - unit: The rows and columns of the image, and of each part of it, are multiples of the unit.
+    - unit: The rows and columns of the image are multiples of the unit.
     - follow_rays: Computes unsaved buffers from `coords`; called by the constructor and whenever
       `coords` is loaded.
     - takes_second_time: The class supports `second_time=True`: it then has an `interval_embedding`
       of s - t, created after all other layers, whose last layer is zero, and `velocity` takes s
       (see `condition`).
-    - croppable: It can be evaluated on a part of its image. A layer's `open_ring` ends its wrapping
-      of columns.
     - any_size: It takes images of any number of rows and columns.
     - radius: Rows above and below a ray that its field depends on; None: all.
     - learns_directions: It learns a vector per direction: scans must not be rotated in training.
@@ -49,7 +46,6 @@ class Backbone(ExactBuffers):
     """
 
     takes_second_time = False
-    croppable = False
     any_size = False
     radius: int | None = None
     learns_directions = False
@@ -159,26 +155,6 @@ class Backbone(ExactBuffers):
 
     def follow_rays(self) -> None:
         """Recompute buffers that derive from `coords`."""
-
-    def cropped(self, rows: Tensor, columns: Tensor) -> Self:
-        """The backbone for a part of its image, (B, C, len(rows), len(columns)); it shares weights.
-
-        Rows and columns are neighbours, ascending, in whole units; columns may wrap around the
-        ring. The part ignores the rest of the image and does not wrap a cropped turn, so that its
-        field differs, mostly near the edges of the crop.
-        """
-        if not self.croppable:
-            raise InputError(
-                f"a {type(self).__name__} cannot be evaluated on a part of its image: ask for all."
-            )
-        part = copy.deepcopy(self, {id(parameter): parameter for parameter in self.parameters()})
-        part.coords = self.coords[:, :, rows][..., columns]
-        if len(columns) < self.coords.shape[-1]:
-            for module in part.modules():
-                if hasattr(module, "open_ring"):
-                    module.open_ring()  # type: ignore[operator]
-        part.follow_rays()
-        return part
 
 
 def precondition(t: Tensor, data_std: float) -> tuple[Tensor, Tensor, Tensor]:

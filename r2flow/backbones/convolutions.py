@@ -35,10 +35,6 @@ class RingConv2d(nn.Conv2d):
     def forward(self, x: Tensor) -> Tensor:
         return super().forward(wrapped(x, 1, 1) if self.ring else x)
 
-    def open_ring(self) -> None:
-        self.ring = False
-        self.padding = (1, 1)
-
 
 class Resample(ExactBuffers):
     """Resample by a factor of 2 with a separable filter.
@@ -77,9 +73,6 @@ class Resample(ExactBuffers):
             crop = (3 * margin - 2 * rows, 3 * margin - 2 * columns)
             return F.conv_transpose2d(x, kernel, stride=2, padding=crop, groups=channels)
         return F.conv2d(x, kernel, stride=2, padding=(rows, columns), groups=channels)
-
-    def open_ring(self) -> None:
-        self.ring = False
 
     def macs(self, inputs: tuple[Tensor, ...], output: Tensor) -> int:
         return output.numel() * self.kernel.numel() ** 2
@@ -209,7 +202,6 @@ class UNet(Backbone, ABC):
     """
 
     takes_second_time = True
-    croppable = True
     # Whether the first convolution has the first level's width, as in the published ADM U-Net.
     multiplied = False
 

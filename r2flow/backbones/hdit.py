@@ -1,6 +1,6 @@
 """HDiT: an hourglass of transformer blocks on image tokens (paper, figure 4), by ray positions."""
 
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import torch
 import torch.nn.functional as F
@@ -52,7 +52,6 @@ class HDiT(Backbone):
     """
 
     takes_second_time = True
-    croppable = True
     features: Tensor  # of the tokens' rays
 
     def __init__(
@@ -158,15 +157,6 @@ class HDiT(Backbone):
     @property
     def learns_directions(self) -> bool:  # type: ignore[override]
         return isinstance(self.spatial_pe, _LearnablePosition)
-
-    def cropped(self, rows: Tensor, columns: Tensor) -> Self:
-        part = super().cropped(rows, columns)
-        if isinstance(part.spatial_pe, _LearnablePosition):
-            patch_h, patch_w = self.patch
-            learned = part.spatial_pe.embedding.detach()[:, rows[::patch_h] // patch_h]
-            learned = learned[:, :, columns[::patch_w] // patch_w]
-            part.spatial_pe.embedding = nn.Parameter(learned, requires_grad=False)
-        return part
 
 
 def time_embedding(channels: int, dropout: float) -> nn.Sequential:

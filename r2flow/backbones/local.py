@@ -23,7 +23,6 @@ class Local(Backbone):
         ring: Whether the columns are a full turn.
     """
 
-    croppable = True
     any_size = True
 
     def __init__(
@@ -58,9 +57,6 @@ class Local(Backbone):
         for block in self.blocks:
             x = block(x)
         return self.answer(F.silu(x))[..., margin : margin + columns].contiguous()
-
-    def open_ring(self) -> None:
-        self.margin = 0
 
 
 class _Block(nn.Module):

@@ -81,11 +81,6 @@ class Attention(nn.Module):
             out = neighbourhood_attention(q, k, v, *self.neighbourhood)
         return self.out_proj(self.dropout(out.flatten(-2)))
 
-    def open_ring(self) -> None:
-        """Shift windows inside at the left and right edges, too."""
-        if self.neighbourhood is not None:
-            self.neighbourhood = self.neighbourhood._replace(ring=False)
-
     def macs(self, inputs: tuple[Tensor, ...], output: Tensor) -> int:
         """Both products of neighbourhood attention, with half a window beyond both ends of the
         ring.

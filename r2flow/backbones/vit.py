@@ -34,7 +34,6 @@ class ViT(Backbone):
     """
 
     takes_second_time = True
-    croppable = True
     features: Tensor  # of the patches' rays
     table: Tensor  # rotations of the tokens
 

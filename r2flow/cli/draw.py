@@ -1,6 +1,6 @@
 """`r2flow sample` and `interpolate`."""
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from typer import Argument, Option
 
@@ -22,18 +22,7 @@ from r2flow.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from r2flow.lidar.region import Region
     from r2flow.model.checkpoint import Checkpoint
-
-
-def _parse_sector(text: str) -> tuple[float, float]:
-    first, last = map(float, text.split(","))
-    return first, last
-
-
-def _parse_rows(text: str) -> tuple[int, int]:
-    first, last = map(int, text.split("-"))
-    return first, last
 
 
 @app.command(
@@ -44,27 +33,8 @@ def sample(
     out: OutOption,
     draw: DrawOptions,
     how: SamplerOptions,
-    sector: Annotated[
-        Any,
-        Option(
-            parser=_parse_sector,
-            metavar="FROM,TO",
-            help="Generate only these azimuths, in degrees: -45,45 is the quarter ahead.",
-        ),
-    ] = None,
-    rows: Annotated[
-        Any,
-        Option(
-            parser=_parse_rows,
-            metavar="FIRST-LAST",
-            help="Image rows, such as 0-31 for the upper half of 64.",
-        ),
-    ] = None,
     model: Annotated[
         str | None, Argument(help="A model, a run folder or a checkpoint file.")
-    ] = None,
-    checkpoint: Annotated[
-        str | None, Option("--checkpoint", "-c", help="The model, as `complete` takes it.")
     ] = None,
     precision: Annotated[
         Literal["32-true", "bf16-mixed"] | None,
@@ -93,16 +63,11 @@ def sample(
     from r2flow.reports.outputs import write_samples
 
     check_folder(out)
-    if model and checkpoint:
-        raise InputError(f"give one model, {model} or -c {checkpoint}.")
-    model = model or checkpoint
     if model is None:
         print_model(DEFAULT)
     loaded = load_checkpoint(model or find_model(DEFAULT), device=choose_device(draw.device))
     sampler = loaded.generator.choose(**how.fields)
     formats = [*dict.fromkeys(format.split(","))] if format else None
-    region = _region(loaded, sector, rows) if sector or rows else None
-    check(not (labels and region), "--labels needs whole scans: leave --sector and --rows out.")
     endings = write_samples(
         loaded,
         out,
@@ -112,7 +77,6 @@ def sample(
         formats,
         pictures,
         draw.batch_size,
-        region,
         precision=precision or usual_precision(loaded.generator, model in (None, DEFAULT)),
         labels=_labelling(labels, loaded) if labels else None,
         label_ids=label_ids,
@@ -131,18 +95,6 @@ def _labelling(name: str, drawn: "Checkpoint") -> "Checkpoint":
     model = load_checkpoint(name, drawn.generator.device)
     check(model.encoding.labels, f"{name} has no labels: give --labels labels.")
     return model.through(drawn.sensor)
-
-
-def _region(checkpoint: "Checkpoint", sector: Any, rows: Any) -> "Region":
-    """Region of --sector and --rows; prints the part that the generator evaluates."""
-    from r2flow.lidar.region import MARGIN, region
-    from r2flow.model.sampling import evaluated_region
-
-    shape = checkpoint.sensor.shape
-    requested = region(shape, sector, rows, MARGIN if sector else 0.0)
-    evaluated = evaluated_region(checkpoint.generator, requested)
-    print(f"generating {evaluated}, for {requested}: {evaluated.share:.0%} of the image")
-    return requested
 
 
 @app.command(

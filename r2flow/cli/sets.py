@@ -134,7 +134,6 @@ def open_set(described: "Described", reading: "Reading", num: int | None) -> "Sc
     from r2flow.data.opening import open_scans
 
     scans = open_scans(described, reading, num=num)
-    described.refuse_parts()
     _ = scans.source[0]  # fail before the other set is read
     return scans
 

@@ -132,16 +132,6 @@ class Described:
                 "to them, and for a model of another sensor point clouds (.ply, .bin)."
             )
 
-    def refuse_parts(self) -> None:
-        """Refuse samples of a region of the image: metrics would treat the rest of the image as
-        missing returns.
-        """
-        if self.manifest.get("recipe", {}).get("region"):
-            raise InputError(
-                f"{self.label} holds a part of each scan alone (see its {MANIFEST}) and cannot be "
-                "compared with whole scans: sample without --sector and --rows."
-            )
-
 
 Spec = str | Path | Described
 

@@ -13,7 +13,6 @@ from r2flow.base.registry import Config, options_of
 from r2flow.flow.solvers.solution import wide
 from r2flow.lidar.encoding import ModelSpace
 from r2flow.lidar.known import Ray
-from r2flow.lidar.region import Region
 from r2flow.samplers import SAMPLERS, FixedSteps, build_sampler, parse_sampler
 from r2flow.samplers.base import Condition, Generated, Progress, Sampler
 
@@ -195,17 +194,6 @@ class Generator(nn.Module):
             return default
         sampler.check(self)
         return sampler
-
-    @property
-    def unit(self) -> tuple[int, int]:
-        """Rows and columns whose multiples a region's offset and size must be."""
-        raise InputError(f"a {type(self).__name__} generates whole images; leave the region out.")
-
-    def part(self, region: Region) -> "Generator":
-        """This generator restricted to a region of whole units; it shares the weights."""
-        if region.share < 1:
-            self.unit  # refuses a region  # noqa: B018
-        return self
 
     def start_from(self, parent: "Generator") -> None:
         """Copy a trained generator's weights; all names and shapes must match."""

@@ -1,21 +1,18 @@
 """Flows, generators by the ODE dx/dt = v(t, x) from noise at t = 0 to data at t = 1, and maps."""
 
 from collections.abc import Mapping
-from copy import copy
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from r2flow.backbones import BACKBONES
 from r2flow.base.errors import InputError
-from r2flow.base.noise import Draws
 from r2flow.base.registry import Config
 from r2flow.flow.maps import MeanVelocity
 from r2flow.flow.solvers import Solution, Velocity, solve
 from r2flow.generators.base import Condition, Generator
 from r2flow.lidar.encoding import ModelSpace
-from r2flow.lidar.region import Region
 from r2flow.samplers import MMPS, FixedSteps, Jump, ODESampler, Sampler
 
 # Default of a new flow.
@@ -86,7 +83,6 @@ class NetworkFlow(Flow):
     """
 
     answer: str = "v(t, x)"  # the quantity that the network predicts
-    region: Region | None = None  # region of the image that is generated; None: all of it
     condition_channels: int = 0  # additional input channels of the backbone, for a condition
     second_time = False  # whether the backbone takes a second time, for flow maps
 
@@ -103,11 +99,6 @@ class NetworkFlow(Flow):
             out_channels=channels,
             **times,
         )
-
-    def further_noise(self, draws: Draws, j: int) -> Tensor:
-        """Noise of step j, cropped to the region."""
-        noise = super().further_noise(draws, j)
-        return noise if self.region is None else self.region.crop(noise)
 
     def start_from(self, parent: Generator) -> None:
         """Copy a flow's weights; layers for a second time are kept and start as a no-op.
@@ -135,21 +126,8 @@ class NetworkFlow(Flow):
         self._take(parent, weights | kept)
 
     @property
-    def unit(self) -> tuple[int, int]:
-        return self.backbone.unit
-
-    @property
     def learns_directions(self) -> bool:  # type: ignore[override]
         return self.backbone.learns_directions
-
-    def part(self, region: Region) -> Self:
-        """The flow on a region; the network does not see the rest of the image."""
-        if region.share == 1:
-            return self
-        part = copy(self)
-        part._modules = {"backbone": self.backbone.cropped(region.rows, region.columns)}
-        part.region = region
-        return part
 
 
 def _optional(name: str) -> bool:

@@ -19,7 +19,6 @@ from torch import Tensor
 from r2flow.base.errors import InputError
 from r2flow.base.registry import Count, Natural, Registry, Share, construct
 from r2flow.lidar.interpolation import nearest_known
-from r2flow.lidar.region import region
 from r2flow.lidar.scan_files import read_numbers
 
 
@@ -84,8 +83,30 @@ def random_points(share: Share) -> Mask:
 def without_sector(first: float, last: float) -> Mask:
     """All rays except a sector from azimuth `first` counter-clockwise to `last`, in degrees."""
     return lambda rays, draws: (
-        ~np.isin(np.indices(rays.shape)[1], region(rays.shape, sector=(first, last)).columns)
+        np.ones(rays.shape, bool) & ~sector_columns(rays.shape[1], first, last)
     )
+
+
+def sector_columns(width: int, first: float, last: float) -> ndarray:
+    """Columns of a turn that a sector touches, (width,) bool; azimuths in degrees.
+
+    (-45, 45) is the quarter ahead, (135, -135) the quarter behind; ends a full turn apart are the
+    full turn.
+
+    Raises:
+        InputError: The sector is narrower than a column.
+    """
+    turn = 360.0 if last - first >= 360 else (last - first) % 360 or 360.0
+    inside = max(abs(first), abs(last)) <= 360 and first != last
+    if not inside or not turn * width >= 360 * (1 - 1e-9):  # also NaN
+        raise InputError(
+            f"the sector {first:.15g},{last:.15g} is narrower than a column, {360 / width:g} "
+            "degrees, or not within -360 to 360 degrees; -180,180 is the full turn."
+        )
+    fuzz = 1e-9 * width  # rounding must not add a column if the sector ends between two
+    left = math.floor((180 - (first + turn)) / 360 * width + fuzz)
+    right = math.ceil((180 - first) / 360 * width - fuzz)
+    return np.isin(np.arange(width), np.arange(left, right) % width)
 
 
 MASKS: Registry[Callable[..., Mask]] = Registry(

@@ -14,7 +14,6 @@ from r2flow.base.errors import InputError, check
 from r2flow.base.noise import Draws
 from r2flow.generators import Answers, Condition, Generator, Sampler
 from r2flow.generators.base import Precision, Progress
-from r2flow.lidar.region import Region
 
 _log = logging.getLogger(__name__)
 
@@ -47,7 +46,6 @@ def sample(
     sampler: Sampler | str | None = None,
     batch_size: int = 1,
     condition: Condition | None = None,
-    region: Region | None = None,
     precision: Precision = "32-true",
     progress: Progress = None,
     **changes: Any,
@@ -59,16 +57,13 @@ def sample(
         sampler: Sampler or its name; None: the generator's default.
         batch_size: Scans per batch. It does not change a fixed-step result beyond rounding.
         condition: Condition of the scans, each tensor (num, ...).
-        region: Region of the image to generate. The network sees `evaluated_region` only, with the
-            same noise as in the whole image.
         precision: Precision of the network, see `Generator.forward`.
         progress: Called after every network evaluation of a batch.
         changes: Fields of the sampler: steps, tolerance, grid, ...
 
     Raises:
         InputError: num or batch_size below 1, a sampler that the generator does not have, an
-            invalid field of the sampler, a condition of the wrong length, or a region that the
-            generator cannot be cropped to.
+            invalid field of the sampler, or a condition of the wrong length.
     """
     generator = source if isinstance(source, Generator) else source.generator
     for count in (num, batch_size):
@@ -85,7 +80,7 @@ def sample(
     for first in range(0, num, batch_size):
         numbers = range(first, min(first + batch_size, num))
         part = condition and {n: value[first : numbers.stop] for n, value in condition.items()}
-        drawn = draw(generator, numbers, seed, sampler, part, region, precision, progress)
+        drawn = draw(generator, numbers, seed, sampler, part, precision, progress)
         warn_unsolved(drawn.converged, first)
         yield drawn
 
@@ -97,7 +92,6 @@ def draw(
     seed: int,
     sampler: Sampler | None = None,
     condition: Condition | None = None,
-    region: Region | None = None,
     precision: Precision = "32-true",
     progress: Progress = None,
 ) -> Samples:
@@ -106,16 +100,6 @@ def draw(
     """
     draws = Draws(seed, numbers)
     noise = draws.start(generator.noise_shape)
-    if region is not None and region.share == 1:
-        region = None
-    if region is not None:
-        evaluated = evaluated_region(generator, region)
-        whole = generator.space.shape[1:]
-        generator = generator.part(evaluated)
-        noise = evaluated.crop(noise)
-        condition = condition and {
-            n: evaluated.crop(x) if x.shape[-2:] == whole else x for n, x in condition.items()
-        }
     start = time.perf_counter()
     generated = generator(
         noise, condition, sampler=sampler, draws=draws, precision=precision, progress=progress
@@ -123,8 +107,6 @@ def draw(
     x_1 = generated.x.cpu()  # also synchronises the GPU
     seconds = time.perf_counter() - start
     images = generator.space.decode(x_1)
-    if region is not None:
-        images = region.place(region.crop(evaluated.place(images)))
     return Samples(
         images,
         numbers[0],
@@ -145,11 +127,3 @@ def warn_unsolved(converged: Tensor, first: int = 0, of: str = "") -> None:
             "1 a last step before it: --sampler adams3:finish=0.001.",
             ", ".join(map(str, lost)), of,
         )  # fmt: skip
-
-
-def evaluated_region(generator: Generator, region: Region) -> Region:
-    """The region plus its margin, rounded outward to the generator's units; the whole image for the
-    whole image.
-    """
-    # Every generator has the whole image.
-    return region.widened(generator.unit if region.share < 1 else (1, 1))

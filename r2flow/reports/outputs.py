@@ -3,11 +3,9 @@
 import re
 import shlex
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
 from numpy import ndarray
 from torch import Tensor
 
@@ -20,7 +18,6 @@ from r2flow.generators import Sampler
 from r2flow.generators.base import Precision
 from r2flow.lidar.labels import SEMANTIC_KITTI, LabelList, label_list, write_labels
 from r2flow.lidar.projection import image_points, write_scan
-from r2flow.lidar.region import Region
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import label
 from r2flow.model.config import ModelConfig
@@ -45,7 +42,6 @@ def write_samples(
     formats: Sequence[str] | None = None,
     pictures: int = 8,
     batch_size: int = 1,
-    region: Region | None = None,
     replace: bool = False,
     precision: Precision = "32-true",
     labels: Checkpoint | None = None,
@@ -55,10 +51,10 @@ def write_samples(
     3-D.
 
     Scan i of a seed is independent of `num` and `batch_size`. A stopped call resumes; `replace`
-    deletes samples of other settings in the folder. Files have the sensor's shape, 0 outside the
-    region. Formats: `ply` and `bin` are points in metres with reflectance, `npy` is the range
-    image, float32 (2 or 1, H, W); default: all that suit the model. `labels`, a labelled model of
-    the same images, adds labels of the points, ids of the list `label_ids`. Returns the formats.
+    deletes samples of other settings in the folder. Formats: `ply` and `bin` are points in metres
+    with reflectance, `npy` is the range image, float32 (2 or 1, H, W); default: all that suit the
+    model. `labels`, a labelled model of the same images, adds labels of the points, ids of the list
+    `label_ids`. Returns the formats.
     """
     generator = checkpoint.generator
     sampler = sampler or generator.sampler
@@ -75,7 +71,6 @@ def write_samples(
         seed,
         sampler,
         label_ids,
-        region=region and asdict(region),
         precision=None if precision == "32-true" else precision,
         labels=labels and weights_hash(labels),
     )
@@ -90,7 +85,7 @@ def write_samples(
     taken: list[int] = []  # evaluations of each scan
     with Bar("sampling", sum(map(len, left)), evaluations=evaluations) as bar:
         for numbers in left:
-            drawn = draw(generator, numbers, seed, sampler, None, region, precision, bar.evaluated)
+            drawn = draw(generator, numbers, seed, sampler, None, precision, bar.evaluated)
             warn_unsolved(drawn.converged, numbers.start)
             while stale:  # the first scan shows that the settings are valid
                 stale.pop().unlink()
@@ -107,9 +102,6 @@ def write_samples(
         each = ", ".join(map(str, taken[:16]))
         more = ", ..." if len(taken) > 16 else ""
         print(f"evaluations of each scan: {each}{more}; mean {sum(taken) / len(taken):.1f}")
-    if region is not None:
-        shown = [region.crop(torch.from_numpy(image)).numpy() for image in shown]
-        rays = region.crop(rays)
     if shown:
         _draw_samples(shown, rays, store.folder, f"{title_of(checkpoint.path)}, seed {seed}")
     return endings

@@ -15,7 +15,6 @@ from r2flow.base.errors import InputError
 from r2flow.base.noise import Draws
 from r2flow.flow.solvers import named_grid
 from r2flow.generators import USUAL, build_generator
-from r2flow.lidar.region import Region
 from r2flow.samplers import SDE, build_sampler
 from r2flow.samplers.stochastic import back, sde, sde_step
 from tests.fields import CONFIG, Field
@@ -129,21 +128,6 @@ def test_another_sampler_has_its_own_defaults_and_the_number_of_steps():
     assert flow.choose("euler", grid=(0.0, 0.5, 1.0), steps=None).times().tolist() == [0, 0.5, 1]
     # one that is not registered
     assert type("Own", (SDE,), {})(steps=9).text.startswith("Own:steps=9:")
-
-
-@pytest.mark.parametrize("method", ["sde", "mmps", "repaint:repeats=2"])
-def test_a_part_has_the_noise_of_the_whole(method):
-    # untrained: no ray sees another
-    flow, how = build_generator(CONFIG).eval(), build_sampler(method, steps=3)
-    region, who = Region((8, 32), 0, 8, 8, 16), Draws(5, [0])
-    x_0 = who.start(flow.noise_shape)
-    known = torch.zeros_like(x_0)
-    known[:, :, ::2] = 1
-    told = {"image": 0.3 * known, "known": known} if how.completes else None
-    whole = flow(x_0, told, sampler=how, draws=who).x
-    cut = told and {name: region.crop(value) for name, value in told.items()}
-    part = flow.part(region)(region.crop(x_0), cut, sampler=how, draws=who).x
-    torch.testing.assert_close(part, region.crop(whole), rtol=0, atol=1e-6)
 
 
 def test_without_fresh_noise_mmps_needs_no_draws():

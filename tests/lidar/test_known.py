@@ -9,7 +9,7 @@ import torch
 from r2flow.base.errors import InputError
 from r2flow.generators.surroundings import nearest_returns
 from r2flow.lidar.interpolation import interpolated
-from r2flow.lidar.known import Ray, parse_mask, ray_states
+from r2flow.lidar.known import Ray, parse_mask, ray_states, sector_columns
 from r2flow.lidar.sensors import SENSORS
 from tests.conftest import ground, refused
 
@@ -161,3 +161,28 @@ def test_the_nearest_return_of_each_quarter_is_that_of_a_search(share, ring):
     row, column = torch.arange(9)[:, None] + down, (torch.arange(16) + aside) % 16
     hit = returned[torch.arange(2)[None, :, None, None].expand_as(row), row, column]
     assert (hit & torch.stack([down[0] < 0, down[1] > 0, aside[2] < 0, aside[3] > 0]))[there].all()
+
+
+@pytest.mark.parametrize(
+    "sector", [(-45, 45), (135, -135), (0, 90), (-178, 20), (170, 190), (-190, -170), (-90, 89.9)]
+)
+def test_a_sector_hides_the_columns_that_it_touches(sector):
+    hidden = sector_columns(72, *sector)  # columns of 5 degrees
+    begin, width = sector[0], (sector[1] - sector[0]) % 360
+    for column in range(72):
+        # by the definition of a column: it spans the azimuths 180 - 5 w down to 175 - 5 w
+        touched = any(
+            (180 - 5 * (column + share / 100) - begin) % 360 < width for share in range(1, 100)
+        )
+        assert hidden[column] == touched
+
+
+@pytest.mark.parametrize("ends", [(10, 10), (math.nan, 10), (0, 720), (10, 10.0000001)])
+def test_impossible_sectors_are_refused(ends):
+    with pytest.raises(InputError, match=r"narrower than a column, .* or not within -360 to 360"):
+        sector_columns(72, *ends)
+
+
+def test_sectors_of_a_full_turn_hide_all_columns():
+    for turn in [(-180, 180), (180, -180), (0, 360), (360, 0), (0, -360), (-360, 360), (10, -350)]:
+        assert sector_columns(72, *turn).all()
