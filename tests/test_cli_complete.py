@@ -265,6 +265,20 @@ def test_what_cannot_be_done_is_one_line(complete, tmp_path, image, options, mes
     assert_refused(complete(tmp_path / "one.npy", *options), message, tmp_path / "out")
 
 
+def test_a_run_completes_a_recording_with_the_options_of_scans(complete, r2flow, tmp_path):
+    """By its sampler the run predicts no errors."""
+    pytest.importorskip("rosbags")
+    sparse_scan(tmp_path / "in" / "0.pcd", steps=200)
+    drive, dense = tmp_path / "drive.mcap", tmp_path / "dense.mcap"
+    assert r2flow("pack", tmp_path / "in", "--rate", 10, "--out", drive).quiet
+    options = ["--to", "vlp16", "--size", "32x64"]
+    refused = complete(drive, *options, "--max-error", 1, out=dense)
+    assert "error: this model predicts no errors: leave max_error out" in refused.stderr
+    assert refused.returncode == 2
+    assert not dense.exists()
+    assert "1 of 1 clouds of /points completed" in complete(drive, *options, out=dense).said
+
+
 def test_two_fields_of_one_name_are_found_before_the_model_runs(complete, tmp_path):
     twice = tmp_path / "twice.csv"
     twice.write_text("x,y,z,_,_,stamp,stamp\n" + "1,2,3,0,1,2,3\n" * 9)

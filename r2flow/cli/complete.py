@@ -30,7 +30,6 @@ from r2flow.cli.options import (
 if TYPE_CHECKING:
     from r2flow.data.described import Described
     from r2flow.data.partial import PartialScan
-    from r2flow.generators.base import Precision
     from r2flow.model.checkpoint import Checkpoint
 
 
@@ -188,8 +187,12 @@ def complete(
         alone = len(what) == 1 and num == 1 and not (part.mask or part.hide or part.scans)
         check(alone, "a recording is completed alone, without --num, --mask, --hide and --scans.")
         model = part.model(checkpoint or DENSIFY, device)
-        print_model(checkpoint or DENSIFY)
-        _complete_recording(Path(what[0]), out, part, how, model, precision, seed)
+        check(not model.encoding.labels, "no labels are written into a recording: unpack it first.")
+        if checkpoint is None:
+            print_model(DENSIFY)
+        precision = precision or usual_precision(model.generator)
+        settings = {**part.settings, "precision": precision, "max_error": max_error}
+        _complete_recording(Path(what[0]), out, part, how, model, settings, seed)
         return
     check_folder(out)
     job = Job(
@@ -235,16 +238,15 @@ def _complete_recording(
     part: _PartialOptions,
     how: SamplerOptions,
     model: "Checkpoint",
-    precision: "Precision | None",
+    settings: dict[str, Any],
     seed: int,
 ) -> None:
-    from r2flow.model.completion import completing, usual_precision
+    from r2flow.model.completion import completing
     from r2flow.reports.outputs import recipe_of
     from r2flow.reports.recordings import complete_recording
 
     check_folder(out.parent)
     sampler = completing(model.generator, **how.fields)
-    settings = {**part.settings, "precision": precision or usual_precision(model.generator)}
     recipe = recipe_of(model, seed, sampler, completion={**settings})
     completer = model.completer(settings.pop("from"), sampler=sampler, **settings)
     complete_recording(

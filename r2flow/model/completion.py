@@ -56,9 +56,15 @@ class Completed(Samples):
         return {"error_68": (errors[0], 0.0), "error_95": (errors[1], 0.0), "p_return": (p, 1.0)}
 
     def within(self, metres: float) -> "Completed":
-        """These answers without added points whose 68 % error exceeds some metres."""
-        kept = ~(self.error(0.68)[0] > metres)
-        return replace(self, images=self.images * kept[:, None])
+        """These answers without added points whose 68 % error exceeds some metres.
+
+        Raises:
+            InputError: The model or its sampler predicts no errors.
+        """
+        (error,) = self.error(0.68)
+        predicts = not error.isnan().any()
+        check(predicts, "this model predicts no errors: leave max_error out, or give densify.")
+        return replace(self, images=self.images * (error <= metres)[:, None])
 
     @property
     def p_return(self) -> Tensor:
@@ -187,10 +193,6 @@ def complete(
         f"give answers and a batch of at least 1; found {num!r}, {batch_size}.",
     )
     check(max_error is None or max_error > 0, f"max_error is metres above 0; found {max_error!r}.")
-    check(
-        max_error is None or isinstance(generator, TransferFlow),
-        f"a {type(generator).__name__} predicts no errors: leave max_error out, or give densify.",
-    )
     if isinstance(sampler, Sampler):
         how = sampler.changed(**changes)
     else:

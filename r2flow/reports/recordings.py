@@ -72,10 +72,8 @@ def complete_recording(
         messages = _replaced(recording, None if everything else topic, topic, store)
         write_recording(out, kept, track(messages, "writing", "messages", total))
         shutil.rmtree(store.folder)
-    left = f", {count - done} left as they are" if done < count else ""
-    print(
-        f"{out}: {done} clouds of {topic} completed{left}, {added / done:,.0f} new points a cloud"
-    )
+    new = f"{added / done:,.0f} new points a cloud"
+    print(f"{out}: {done} of {count} clouds of {topic} completed, {new}")
 
 
 def _make_parts(
