@@ -160,7 +160,7 @@ def reading(path: Path, largest: int, what: str = "file", least: int = 1) -> Ite
                 else "not a regular file"
             )
             raise InputError(f"{path} is {kind}.")
-        _refuse_pointer(path, size)
+        refuse_pointer(path)
         if size < least:
             raise InputError(f"{path} is empty ({size} bytes); fetch or write it again.")
         if size > largest:
@@ -172,11 +172,10 @@ def reading(path: Path, largest: int, what: str = "file", least: int = 1) -> Ite
         yield
 
 
-def _refuse_pointer(path: Path, size: int) -> None:
+def refuse_pointer(path: Path) -> None:
     """Refuse the pointer to a file that Git keeps elsewhere."""
-    if size > 1024:
-        return
-    start = path.read_bytes()
+    with path.open("rb") as file:
+        start = file.read(40)
     if start.startswith(b"version https://git-lfs"):
         raise InputError(f"{path} is a Git LFS pointer, not the file itself: git lfs pull.")
     if b"/annex/objects/" in start[:32]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from r2flow.base.errors import InputError, check, require
-from r2flow.base.files import reading_errors
+from r2flow.base.files import reading_errors, refuse_pointer
 from r2flow.lidar.point_cloud2 import CLOUD, ENCODINGS, Scan, read_message
 
 _ENDINGS = (".mcap", ".db3", ".bag")
@@ -148,6 +148,8 @@ def _files(path: Path) -> list[Path]:
 
 
 def _open(path: Path) -> AbstractContextManager[Recording]:
+    if path.is_file():
+        refuse_pointer(path)
     if path.suffix.lower() == ".mcap":
         from r2flow.lidar.mcap_files import open_mcap  # needs this module
 

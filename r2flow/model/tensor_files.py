@@ -15,7 +15,7 @@ from torch import Tensor
 
 from r2flow.base.config import check_tree
 from r2flow.base.errors import InputError
-from r2flow.base.files import reading_errors
+from r2flow.base.files import reading_errors, refuse_pointer
 from r2flow.base.hashing import state_hash
 from r2flow.model.parts import HYPER, NOTES
 from r2flow.model.published import inert, plain
@@ -26,6 +26,7 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> Any:
     cannot run code.
     """
     with reading_errors(Path(path)), open(path, "rb") as file:
+        refuse_pointer(Path(path))
         return read_torch(file, path, map_location)
 
 
@@ -87,6 +88,7 @@ def _check_archive(file: IO[bytes], name: object) -> None:
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read the tensors and the metadata of a `.safetensors`."""
+    refuse_pointer(path)
     with safe_open(path, framework="pt") as file:
         return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
 

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from r2flow.base.errors import InputError, _warned
+from r2flow.lidar.bags import read_bag
 from r2flow.lidar.scan_files import NoPointsError, read_points, read_range_image
+from r2flow.model.tensor_files import read_checkpoint, read_tensors
 
 
 def turn(points: int = 6000) -> np.ndarray:
@@ -68,6 +70,15 @@ def test_pointers_of_git_are_named_in_every_format(tmp_path, ending):
     path.write_text("/annex/objects/SHA256E-s1--0.bin\n")
     with pytest.raises(InputError, match="a git-annex pointer"):
         read_points(path)
+
+
+@pytest.mark.parametrize("ending", [".mcap", ".bag", ".db3", ".ckpt", ".safetensors"])
+def test_pointers_to_recordings_and_checkpoints_are_named(tmp_path, ending):
+    readers = {".ckpt": read_checkpoint, ".safetensors": read_tensors}
+    path = tmp_path / f"file{ending}"
+    path.write_text(f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 9\n")
+    with pytest.raises(InputError, match="a Git LFS pointer, not the file itself: git lfs pull"):
+        readers.get(ending, lambda path: next(read_bag(path)))(path)
 
 
 def ply(kind: str, name: str, count: int, row: str) -> str:
