@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -37,6 +38,20 @@ def test_a_plug_in_of_the_page_trains(plugins: Path, name: str, choices: list[st
     tiny = [one for one in TINY if name != "corridors" or not one.startswith("data.scenes")]
     done = r2flow("train", f"--plugin={name}.py", *tiny, *choices, "run_dir=run")
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_sampler_of_the_page_takes_a_share_of_each_step():
+    import torch
+
+    from r2flow.samplers import SAMPLERS
+
+    with loaded():
+        exec(BLOCKS["shrunken"], {"__name__": "shrunken"})
+        sampler = SAMPLERS["shrunken"](steps=4, share=0.5)
+    generator = SimpleNamespace(field=lambda condition: lambda t, x: torch.full_like(x, 3.0))
+    drawn = sampler(generator, torch.ones(2, 2, 4, 8), None, None, lambda: None)
+    # x = 1 + 0.5 * 3 * (1 - 0)
+    torch.testing.assert_close(drawn.x, torch.full((2, 2, 4, 8), 2.5))
 
 
 def test_the_metric_of_the_page_is_a_difference_of_means(plugins: Path):
