@@ -94,7 +94,7 @@ BASES = {
     "interpolate": "interpolate run scans/000000.bin scans/000001.bin -o out", "sensor": "sensor scans",
     "prepare": "prepare scans -o out", "evaluate": "evaluate scans run --metrics jsd", "compare": "compare run",
     "curvature": "report curvature run -o out", "solvers": "report solvers -o out",
-    "backbones": "report backbones", "paper": "report paper run -o out",
+    "backbones": "report backbones", "paper": "report paper run --results nowhere -o out",
 }  # fmt: skip
 WORDS = (
     "device",

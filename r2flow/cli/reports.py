@@ -179,23 +179,17 @@ def paper(
         list[str],
         Argument(help="Runs, checkpoint files or models; ROLE=MODEL selects the row."),
     ],
-    out: OutOption,
     results: Annotated[
-        list[Path] | None,
+        list[Path],
         Option(help="JSON file of `r2flow evaluate REAL MODEL... --json FILE`; may be repeated."),
-    ] = None,
-    real: Annotated[str | None, Option(help=f"Real scans for figure 7: {SETS}.")] = None,
-    steps: Annotated[int, Option(min=1, help="Euler steps of the paths in figure 8.")] = 256,
-    device: DeviceOption = "auto",
+    ],
+    out: OutOption,
 ) -> None:
-    """Reproduce the paper's tables I and II and figures 6 to 8, printed numbers next to those of
-    `evaluate`.
-    """
+    """Reproduce the paper's table I and figure 6, printed numbers next to those of `evaluate`."""
     from r2flow.reports.paper import report_paper
 
-    device = choose_device(device)
     check_folder(out)
-    _finish(report_paper(models, results or [], real, steps, device), out)
+    _finish(report_paper(models, results), out)
 
 
 @app.command(

@@ -1,33 +1,17 @@
-"""The paper's tables I and II and figures 6 to 8 from runs: the printed numbers next to evaluated
-ones.
-"""
+"""The paper's table I and figure 6 from runs: the printed numbers next to evaluated ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
-from matplotlib.figure import Figure
 
 from r2flow.base.errors import InputError
 from r2flow.base.files import read_json
-from r2flow.base.progress import track
-from r2flow.data.detection import reading_for
-from r2flow.data.opening import open_scans
-from r2flow.data.sets import ScanSet
-from r2flow.generators import Flow
 from r2flow.model.checkpoint import Checkpoint, load_checkpoint
 from r2flow.model.saving import weights_hash
-from r2flow.reports.backbones import cost
-from r2flow.reports.curvature import (
-    curvature_figure,
-    curvature_text,
-    measure_paths,
-    trajectories_figure,
-)
 from r2flow.reports.evaluation import sampled_rows, speed_figure
 from r2flow.reports.pages import Page
-from r2flow.reports.pictures import contact_sheet
 from r2flow.reports.tables import Part, Row, Table, short_names, shown
 from r2flow.reports.verdict import PRINTED
 
@@ -51,16 +35,6 @@ _SYSTEMS = {
 }
 # Stage -> role, and the stage that its parent was trained by.
 _ROLES = {"rectify": ("1-RF", None), "reflow": ("2-RF", "rectify"), "distill": ("{}-TD", "reflow")}
-_ARCHITECTURES = {
-    "backbone": "backbone",
-    "parameters": "parameters",
-    "gmac": "GMAC",
-    "gmac_printed": "paper",
-    "latency_ms": "ms an evaluation",
-    "latency_printed": "paper",
-    "frd": "FRD",
-    "frd_printed": "paper",
-}
 
 
 @dataclass(frozen=True)
@@ -91,66 +65,44 @@ def role_of(checkpoint: Checkpoint, label: str) -> str:
     return role.format(stage.options.get("steps"))
 
 
-def report_paper(
-    models: Sequence[str],
-    results: Sequence[Path] = (),
-    real: str | None = None,
-    steps: int = 256,
-    device: str = "cpu",
-) -> Page:
-    """The page of the paper's tables and figures.
-
-    Figure 7 begins with a scan of `real`, figure 8 has four paths of `steps` Euler steps.
+def report_paper(models: Sequence[str], results: Sequence[Path]) -> Page:
+    """The page of the paper's table I and figure 6.
 
     Args:
         models: Runs, checkpoint files or models, as MODEL or ROLE=MODEL.
         results: JSON files of `r2flow evaluate`.
     """
     rows = [row for file in results for row in read_results(file)]
-    runs = _paper_runs(models, device)
+    runs = _paper_runs(models)
     run_of = {weights_hash(run.checkpoint): run for run in runs}
     evaluated = [
         {**row, "role": run_of[row["weights"]].role} for row in rows if row["weights"] in run_of
     ]
     names = ", ".join(f"{run.label} ({run.role})" for run in runs)
-    if rows and not evaluated:
+    if not evaluated:
         raise InputError(
             f"the results are of other models or checkpoints than {names}: evaluate these."
         )
-    scans = real and open_scans(real, reading_for([real], runs[0].checkpoint))
-    architectures = _architecture_rows(runs, evaluated, device)
     protocols = "; ".join(dict.fromkeys(row["protocol"] for row in evaluated))
     text: list[Part] = [
         f"Generators: {names}.",
         _table_i(evaluated),
-        f"Evaluated rows: {protocols or 'none'}. Printed rows: {_PROTOCOL} kitti_360. Figures with "
-        "* are of another protocol than printed ones, and not comparable.",
-        Table(architectures, _ARCHITECTURES, "Table II: velocity estimators"),
+        f"Evaluated rows: {protocols}. Printed rows: {_PROTOCOL} kitti_360. Figures with * are of "
+        "another protocol than printed ones, and not comparable.",
     ]
-    figures = {"figure_7": _scans_figure(runs, scans or None)}
     metrics = [f"{name}/{name}" for name in COLUMNS]
     metrics = [name for name in metrics if any(name in row for row in evaluated)]
+    figures = {}
     if metrics:
         labelled = [
             {**row, "flow": f"{run_of[row['weights']].label} ({row['role']})"} for row in evaluated
         ]
         figures["figure_6"] = speed_figure(labelled, metrics)
-    generators = [(run, run.checkpoint.generator) for run in runs]
-    flows = [run for run, model in generators if isinstance(model, Flow) and not model.fixed]
-    if flows:
-        paths = {
-            run.label: measure_paths(run.checkpoint, run.label, steps=steps, batch_size=4)
-            for run in track(flows, "following paths")
-        }
-        figures["figure_8a"] = curvature_figure(paths)
-        figures["figure_8b"] = trajectories_figure(paths)
-        text += ["## Figure 8: straightness", *curvature_text(paths)]
-    title = "The paper's tables and figures"
-    more = {"architectures": architectures}
-    return Page("paper", title, text, evaluated, figures, {"sampled scans": 0}, device, more)
+    title = "The paper's table I and figure 6"
+    return Page("paper", title, text, evaluated, figures, {}, "cpu")
 
 
-def _paper_runs(models: Sequence[str], device: str) -> list[PaperRun]:
+def _paper_runs(models: Sequence[str]) -> list[PaperRun]:
     named = []
     for text in models:
         role, equals, model = text.partition("=")
@@ -158,28 +110,11 @@ def _paper_runs(models: Sequence[str], device: str) -> list[PaperRun]:
     labels = short_names([model for _, model in named])
     runs: list[PaperRun] = []
     for (role, model), label in zip(named, labels, strict=True):
-        checkpoint = load_checkpoint(model, device)
+        checkpoint = load_checkpoint(model)
         runs.append(PaperRun(role or role_of(checkpoint, label), model, checkpoint))
         if not checkpoint.generator.unconditional:
             raise InputError(f"{model} does not generate scans from noise.")
-        if checkpoint.sensor.shape != runs[0].checkpoint.sensor.shape:
-            raise InputError(f"{model} makes images of another size than {runs[0].label}.")
     return runs
-
-
-def _scans_figure(runs: Sequence[PaperRun], real: ScanSet | None) -> Figure:
-    """Figure 7: a real scan, and the first sample of each generator."""
-    images = {}
-    if real is not None:
-        images["real"] = real[0].numpy()
-    for run in track(runs, "sampling", "generators"):
-        generator = run.checkpoint.generator
-        count = generator.sampler.evaluations(generator)
-        steps = f"NFE {count}" if count else "adaptive steps"
-        images[f"{run.role}, {steps}, {run.label}"] = run.checkpoint.sample(1)[0].numpy()
-    channels = min(map(len, images.values()))
-    rays = runs[0].checkpoint.sensor.rays()
-    return contact_sheet([image[:channels] for image in images.values()], rays, list(images))
 
 
 def read_results(file: Path) -> list[Row]:
@@ -223,35 +158,3 @@ def _evaluated_line(row: Row) -> Row:
         if value is not None:
             line[name] = shown(value * factor) + ("" if same else "*")
     return line
-
-
-def _architecture_rows(runs: Sequence[PaperRun], rows: Sequence[Row], device: str) -> list[Row]:
-    """Table II: one row per 1-RF, with the printed row of equal parameters, and FRD of the most
-    evaluations.
-    """
-    lines = []
-    for run in runs:
-        if run.role != "1-RF":
-            continue
-        config = run.checkpoint.config
-        measured = cost(config.model, 3, device)
-        printed = _same_architecture(measured["parameters"])
-        line = {**printed, **measured, "backbone": config.backbone}
-        weights = weights_hash(run.checkpoint)
-        evaluated = [row for row in rows if row["weights"] == weights and "frd/frd" in row]
-        best = max(evaluated, key=lambda row: row["evaluations"], default=None)
-        if best and best["evaluations"] >= _MANY:
-            line["frd"] = _evaluated_line(best)["frd"]
-        lines.append(line)
-    return lines
-
-
-def _same_architecture(parameters: int) -> Row:
-    """The printed row of table II with this number of parameters; empty without one.
-
-    Within 0.4 %: the printed 125.5 M are 125.2 M.
-    """
-    for row in _PRINTED["table_2"].values():
-        if abs(parameters - row["parameters"]) < 4e-3 * row["parameters"]:
-            return row
-    return {}
