@@ -151,7 +151,6 @@ def info(
         ),
     ] = None,
     json: Annotated[bool, Option("--json", help="Print JSON, with the whole config.")] = False,
-    everything: Annotated[bool, Option("--all", help="Print the whole config, too.")] = False,
     add: Annotated[
         tuple[str, Path] | None,
         Option(metavar="NAME FILE", help="Install a feature network from its file or folder."),
@@ -163,7 +162,6 @@ def info(
     r2flow does not download networks: get the published file, then --add it. It is loaded as
     tensors only, checked and stored in R2FLOW_WEIGHTS (default ~/.cache/r2flow/weights).
     """
-    from r2flow.base.config import flatten
     from r2flow.metrics.extractors.base import add as install
     from r2flow.metrics.extractors.base import kept_file
     from r2flow.reports.contents import describe, print_known
@@ -178,12 +176,10 @@ def info(
         print(to_json(describe(checkpoint), indent=2))
     else:
         about = describe(checkpoint)
-        config = about.pop("config")
+        del about["config"]  # of --json
         rows = [
             (_LABELS.get(key, key), words(x) if isinstance(x, dict) else str(x))
             for key, x in about.items()
             if x is not None
         ]
-        if everything:
-            rows += [(key, str(value)) for key, value in flatten({"config": config})]
         print_table(rows, ("", ""))

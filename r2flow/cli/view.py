@@ -43,13 +43,6 @@ def show(
         Literal["png", "pdf", "npy"],
         Option(help="png, pdf: pictures; npy: range images, (2, H, W)."),
     ] = "png",
-    fixed: Annotated[
-        bool,
-        Option(
-            "--fixed",
-            help="Colours and view of a street. Default: those that fit all scans of the command.",
-        ),
-    ] = False,
 ) -> None:
     """Draw each scan (range, reflectance, bird's-eye view, perspective) as a PNG or PDF, or write
     range images.
@@ -57,7 +50,7 @@ def show(
     from r2flow.base.files import check_folder, save_array
     from r2flow.data.described import describe
     from r2flow.reports.figures import save_figure
-    from r2flow.reports.pictures import STREET, scan_figure, view_of
+    from r2flow.reports.pictures import scan_figure, view_of
     from r2flow.reports.view.panels import scan_panels, share_scale
 
     described = [describe(spec) for spec in scans]
@@ -67,7 +60,7 @@ def show(
     names: set[str] = set()
     readings = {one: how.reading([one], estimate=True) for one in described}
     panels = [panel for _, panel in scan_panels(share_scale(readings, most), most)]
-    view = STREET if fixed else view_of(*((panel.images[0][:2], panel.rays) for panel in panels))
+    view = view_of(*((panel.images[0][:2], panel.rays) for panel in panels))
     for panel in panels:
         stem = Path(panel.caption).stem
         versions = (stem if number == 1 else f"{stem}_{number}" for number in count(1))
