@@ -36,7 +36,6 @@ nope # No such command 'nope'
 sampel -c run -o out # Did you mean 'sample'?
 densify x.pcd -o out # Did you mean 'r2flow complete SCANS -c densify --out FOLDER'?
 street # Did you mean 'r2flow sample -c street --out FOLDER'?
-sample run -c run -o out # give one model, run or -c run
 sample empty -o out
 sample nowhere -o file.txt # file.txt is not a folder that can be written to
 complete nowhere -o file.txt # file.txt is not a folder that can be written to
