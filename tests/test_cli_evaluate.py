@@ -72,7 +72,6 @@ def test_the_json_holds_everything_about_a_figure(r2flow, real, generated, tmp_p
     assert "images 8x64 of hdl64e, " in said  # the sensor that scans are compared under
     for words in ("JSD x 10^2", "MMD x 10^4", f"{100 * jsd['figures']['jsd']:#.4g}", "(10 : 12)"):
         assert words in said
-    assert len(list((tmp_path / "cache" / "statistics").iterdir())) == 4
 
 
 def test_a_scale_of_reflectance_is_asked_for_where_it_matters(r2flow, real, tmp_path):
@@ -249,10 +248,6 @@ def test_a_distilled_model_keeps_its_steps(points, r2flow, real, tmp_path):
             "needs all times; this flow is distilled for euler"
             in r2flow(*verb.split(), td, *scans, "-o", "a.html").refusal
         )
-    assert (
-        "figure_7.png"
-        in r2flow("report", "paper", td, "--real", real, "-o", tmp_path / "paper").said
-    )
 
 
 def test_an_adaptive_solver_is_one_set(points, saved):
@@ -335,11 +330,7 @@ def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path
             "--json",
             str(out),
         ]
-        environment = {
-            **os.environ,
-            "OMP_NUM_THREADS": "1",
-            "R2FLOW_CACHE": str(out.with_suffix("")),
-        }
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         done = subprocess.run(
             [sys.executable, *command], env=environment, capture_output=True, text=True, timeout=300
         )
@@ -349,8 +340,6 @@ def test_processes_of_torchrun_give_the_figures_of_one(real, generated, tmp_path
 
     expected = run(tmp_path / "one.json")
     shared = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(ranks))
-    assert run(tmp_path / "many.json", *shared) == pytest.approx(expected, rel=1e-10)
-    # from the cache
     assert run(tmp_path / "many.json", *shared) == pytest.approx(expected, rel=1e-10)
 
 

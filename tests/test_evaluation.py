@@ -20,10 +20,8 @@ from r2flow.data.sets import ScanSet, fixed_choice
 from r2flow.evaluation import measuring
 from r2flow.evaluation.comparing import Comparison, with_equal_panels
 from r2flow.evaluation.measuring import (
-    Cache,
     Measurer,
     MetricResult,
-    Statistics,
     Work,
     key_of,
 )
@@ -40,10 +38,8 @@ from tests.test_sampling import flow
 READING = Reading(SENSOR)
 
 
-def measured(
-    real: ScanSet, generated: ScanSet, cache: Cache | None = None, work: Work | None = None
-):
-    measurer = Measurer({"jsd": JSD(), "mmd": MMD()}, work or Work(), cache=cache)
+def measured(real: ScanSet, generated: ScanSet, work: Work | None = None):
+    measurer = Measurer({"jsd": JSD(), "mmd": MMD()}, work or Work())
     return measurer.measure(measurer.gather(real), generated)
 
 
@@ -63,86 +59,45 @@ def test_figures_do_not_depend_on_order_batches_or_reading_processes(real, gener
     assert found == pytest.approx(expected, rel=1e-10)
 
 
-class TestCache:
-    def test_what_is_kept_gives_the_same_figures_and_is_not_read_again(
-        self, real, generated, tmp_path, monkeypatch
-    ):
-        cache, other = Cache(tmp_path / "cache"), open_scans(str(generated), READING)
-        fresh = figures(open_scans(str(real), READING), other)
-        assert figures(open_scans(str(real), READING), other, cache) == fresh
-        truth = open_scans(str(real), READING)
-        monkeypatch.setattr(
-            ScanSet, "batches", lambda *_: pytest.fail("the real scans were read again")
+def test_any_change_of_what_decides_a_figure_has_another_key(real, tmp_path, monkeypatch):
+    def key(
+        root: Path = real,
+        reading: Reading = READING,
+        metric: JSD | None = None,
+        rule: str = "all",
+    ) -> str:
+        return key_of(metric or JSD(), open_scans(str(root), reading), rule)
+
+    first = key()
+    assert key() == first
+
+    class Other(JSD):
+        protocol = property(
+            lambda self: JSD.protocol.fget(self).__class__("jsd", "other", weights="abc")
         )
-        Measurer({"jsd": JSD(), "mmd": MMD()}, cache=cache).gather(truth)
-        monkeypatch.undo()
-        assert figures(truth, other, cache) == fresh
 
-    def test_any_change_of_what_made_them_misses_it(self, real, tmp_path, monkeypatch):
-        def key(
-            root: Path = real,
-            reading: Reading = READING,
-            metric: JSD | None = None,
-            rule: str = "all",
-        ) -> str:
-            return key_of(metric or JSD(), open_scans(str(root), reading), rule)
-
-        first = key()
-        assert key() == first
-
-        class Other(JSD):
-            protocol = property(
-                lambda self: JSD.protocol.fget(self).__class__("jsd", "other", weights="abc")
-            )
-
-        keys = [first, key(rule="10 of 12"), *(key(metric=metric) for metric in (MMD(), Other()))]
-        changes = {"reflectance": False}, {"projection": "unfolding"}, {"convention": "reference"}
-        keys += [
-            key(reading=Reading(SENSOR, **one)) for one in (*changes, {"reflectance_scale": 2})
-        ]
-        keys.append(key_of(JSD(), open_scans(str(real), READING, num=7), "all"))
-        monkeypatch.setattr(measuring, "FORMAT", measuring.FORMAT + 1)
+    keys = [first, key(rule="10 of 12"), *(key(metric=metric) for metric in (MMD(), Other()))]
+    changes = {"reflectance": False}, {"projection": "unfolding"}, {"convention": "reference"}
+    keys += [key(reading=Reading(SENSOR, **one)) for one in (*changes, {"reflectance_scale": 2})]
+    keys.append(key_of(JSD(), open_scans(str(real), READING, num=7), "all"))
+    monkeypatch.setattr(measuring, "FORMAT", measuring.FORMAT + 1)
+    keys.append(key())
+    plugin = tmp_path / "plugin.py"
+    monkeypatch.setattr(
+        "r2flow.base.plugins._loaded", {str(plugin): "plugin.py", "a.module": "a.module"}
+    )
+    for code in ("x = 1", "x = 2"):
+        plugin.write_text(code)
         keys.append(key())
-        plugin = tmp_path / "plugin.py"
-        monkeypatch.setattr(
-            "r2flow.base.plugins._loaded", {str(plugin): "plugin.py", "a.module": "a.module"}
-        )
-        for code in ("x = 1", "x = 2"):
-            plugin.write_text(code)
-            keys.append(key())
-        monkeypatch.undo()
-        scan = real / "000003.npy"
-        scan.write_bytes(scan.read_bytes())  # another time, the same content
-        keys.append(key())
-        np.save(scan, np.zeros((2, 8, 64)))  # another size
-        keys.append(key())
-        scan.rename(real / "000099.npy")
-        keys.append(key())
-        assert len(set(keys)) == len(keys)
-
-    def test_a_damaged_file_is_gathered_again(self, real, generated, tmp_path):
-        cache = Cache(tmp_path / "cache")
-        there, other = (open_scans(str(folder), READING) for folder in (real, generated))
-        expected = figures(there, other, cache)
-        for path in cache.folder.glob("*/*"):
-            path.write_bytes(path.read_bytes()[:100])
-        assert figures(there, other, cache) == expected
-        # which cannot be read or written
-        assert figures(there, other, Cache(tmp_path / ("n" * 256))) == expected
-
-    def test_a_transposed_state_is_kept_and_another_recipe_gathered_again(self, tmp_path):
-        cache, state = Cache(tmp_path), torch.arange(6.0).view(2, 3).T
-        cache.write("key", Statistics({"x": state}, 1, 0))
-        assert torch.equal(cache.read("key").states["x"], state)
-        (path,) = tmp_path.glob("*/*.safetensors")
-        recipe = cache._store("key").digest.encode()
-        path.write_bytes(path.read_bytes().replace(recipe, recipe[::-1]))
-        assert cache.read("key") is None
-
-    def test_sampled_scans_are_never_kept(self, tmp_path):
-        measurer = Measurer({"jsd": JSD()}, cache=Cache(tmp_path / "cache"))
-        measurer.gather(sampled_set(flow(), "flow", 2))
-        assert not (tmp_path / "cache").exists()
+    monkeypatch.undo()
+    scan = real / "000003.npy"
+    scan.write_bytes(scan.read_bytes())  # another time, the same content
+    keys.append(key())
+    np.save(scan, np.zeros((2, 8, 64)))  # another size
+    keys.append(key())
+    scan.rename(real / "000099.npy")
+    keys.append(key())
+    assert len(set(keys)) == len(keys)
 
 
 def test_some_metrics_are_of_the_field_s_subset_and_some_of_every_scan(real, monkeypatch):

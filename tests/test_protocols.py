@@ -176,6 +176,6 @@ def test_a_scan_of_another_scale_is_named_in_one_line(r2flow, measured, generate
     scan = np.load(generated / "000004.npy")
     scan[1] = 255
     np.save(generated / "000004.npy", scan)
-    options = ("--metrics", "frechet_handcrafted", "--size", "8x64", "--workers", 0, "--no-cache")
+    options = ("--metrics", "frechet_handcrafted", "--size", "8x64", "--workers", 0)
     said = r2flow("evaluate", measured[0], generated, *options).refusal
     assert re.search("scan 000004.npy of .*generated: its reflectance goes up to 255", said)

@@ -73,7 +73,7 @@ def _evaluate(
     from r2flow.data.described import describe
     from r2flow.evaluation.comparing import Comparer, pairs_of, with_equal_panels
     from r2flow.evaluation.copies import find_nearest, with_copies
-    from r2flow.evaluation.measuring import Cache, Work
+    from r2flow.evaluation.measuring import Work
     from r2flow.evaluation.protocols import PROTOCOLS
     from r2flow.evaluation.sets import is_checkpoint
     from r2flow.metrics import METRICS
@@ -100,9 +100,8 @@ def _evaluate(
     reflectance = all(scans.about.get("reflectance") for scans in sets)
     metrics = named_metrics or possible_metrics(reflectance, options, device)
     work = Work(options.batch_size, options.workers)
-    cache = None if options.no_cache else Cache()
     results = options.out and options.out / "results"
-    compare = Comparer(metrics, work, rules, cache, results)
+    compare = Comparer(metrics, work, rules, results)
     compare.check(sets)
     training = trained and open_set(trained, reading, None)
     for folder in filter(None, (options.out, options.json and options.json.parent)):

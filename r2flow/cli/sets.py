@@ -71,9 +71,6 @@ class EvaluateOptions:
         str | None, Option(help=f"Training scans, to find copies by distance: {SETS}.")
     ] = None
     train_split: SplitOption = None
-    no_cache: Annotated[
-        bool, Option("--no-cache", help="Recompute the statistics of the real scans.")
-    ] = False
     num: Annotated[
         int | None,
         Option(min=1, help="Scans to sample or simulate (1000), or to read per folder (all)."),

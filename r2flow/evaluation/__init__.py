@@ -1,1 +1,1 @@
-"""Evaluation of generated against real scans: sets, protocols, cached statistics, results."""
+"""Evaluation of generated against real scans: sets, protocols, statistics, results."""

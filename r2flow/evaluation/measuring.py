@@ -1,4 +1,4 @@
-"""Metrics of generated against real scans; statistics of real scans are cached on disk."""
+"""Metrics of generated against real scans."""
 
 import json
 import logging
@@ -6,13 +6,11 @@ import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from r2flow.base.errors import InputError
-from r2flow.base.files import cache_folder
 from r2flow.base.plugins import plugin_digests
 from r2flow.base.processes import rank_and_world_size, sum_over_processes
 from r2flow.base.progress import Bar
@@ -22,11 +20,10 @@ from r2flow.evaluation.protocols import R2FLOW, WORDS, Rules
 from r2flow.evaluation.sets import SampledScans
 from r2flow.metrics.base import Protocol, ScanMetric
 from r2flow.metrics.scans import Scans
-from r2flow.store import Damaged, Store, checksum
 
 _log = logging.getLogger(__name__)
 
-FORMAT = 12  # increment if statistics or figures change for the same scans and protocol
+FORMAT = 12  # increment if figures change for the same scans and protocol
 # Metrics of single-scan histograms use this many real scans, by a fixed shuffle; metrics of
 # features use all.
 REAL_SCANS = 10_000
@@ -63,35 +60,8 @@ class MetricResult:
     remarks: Sequence[str] = ()
 
 
-class Cache:
-    """Folder of statistics of real scans; names in it are hashes of all that they depend on."""
-
-    def __init__(self, folder: str | Path | None = None) -> None:
-        self.folder = Path(folder or cache_folder("R2FLOW_CACHE") / "statistics")
-
-    def _store(self, key: str) -> Store:
-        return Store(self.folder / checksum(key)[:24], "statistics", {"key": key})
-
-    def read(self, key: str) -> Statistics | None:
-        """Read the statistics of a key from `key_of`; None if missing, damaged or not readable."""
-        try:
-            states, notes = self._store(key).read(0)
-        except (OSError, Damaged, InputError):
-            return None
-        return Statistics({name: torch.from_numpy(x) for name, x in states.items()}, **notes)
-
-    def write(self, key: str, found: Statistics) -> None:
-        """Store statistics; only warn if the disk is not writable."""
-        notes = dict(vars(found))
-        states = {name: state.numpy() for name, state in notes.pop("states").items()}
-        try:
-            self._store(key).write(0, states, notes)
-        except OSError as error:
-            _log.warning("statistics are not cached: %s: %s", self.folder, error.strerror or error)
-
-
 def key_of(metric: ScanMetric, scans: ScanSet, choice: str) -> str:
-    """Everything a metric's statistics of a set depend on, as JSON.
+    """Everything a metric's figures for a set of real scans depend on, as JSON.
 
     The key contains scan files with sizes and times (or seed, or manifest), sensor, projection,
     mask, subset, the metric's protocol with its weights' hash, the code of plug-ins, the device
@@ -124,7 +94,6 @@ class Measurer:
     metrics: _Metrics
     work: Work = Work()
     rules: Rules = R2FLOW
-    cache: Cache | None = None  # of the statistics of real scans
 
     def check(self, sets: Iterable[ScanSet]) -> None:
         """Refuse a set without the reflectance that a metric needs, before reading scans."""
@@ -137,33 +106,20 @@ class Measurer:
                 )
 
     def gather(self, real: ScanSet) -> dict[str, Statistics]:
-        """Compute each metric's statistics of real scans, or read them from the cache."""
-        gathered = {}
-        keys = {}
-        places = self.rules.real
-        points = "" if places == "centre" else f", points {WORDS[places]}"
+        """Compute each metric's statistics of real scans."""
         groups: dict[str, list[str]] = {}  # of metrics, by their choice of scans
         numbers: dict[str, Sequence[int]] = {}
         for name, metric in self.metrics.items():
             some, choice = self._scans_for(metric, real)
-            if self.cache is not None and real.identity is not None:
-                keys[name] = key_of(metric, real, choice + points)
-                cached = self.cache.read(keys[name])
-                readers = _of_all_processes(int(cached is not None))
-                if cached is not None and readers == rank_and_world_size()[1]:
-                    gathered[name] = cached
-                    continue
             metric.reset()
             groups.setdefault(choice, []).append(name)
             numbers[choice] = some
+        gathered = {}
         for choice, names in groups.items():
             empty = self._update(names, real, numbers[choice], True)
             for name in names:
                 states = self.metrics[name].real_state()
-                found = Statistics(states, len(numbers[choice]), empty, choice)
-                gathered[name] = found
-                if self.cache is not None and name in keys:
-                    self.cache.write(keys[name], found)
+                gathered[name] = Statistics(states, len(numbers[choice]), empty, choice)
         return gathered
 
     def _scans_for(self, metric: ScanMetric, real: ScanSet) -> tuple[Sequence[int], str]:

@@ -152,7 +152,7 @@ class ScanMetric(Metric):
         return self.figures()
 
     def real_state(self) -> dict[str, Tensor]:
-        """States of the real set, on the CPU and gathered from all processes, for a disk cache."""
+        """States of the real set, on the CPU and gathered from all processes."""
         with self.sync_context():
             states = {
                 name: _joined(value) if name == "real_rows" else value[0].clone()

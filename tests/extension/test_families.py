@@ -85,7 +85,6 @@ def test_samples_are_measured(trained: tuple[Family, Path], tmp_path: Path):
         2,
         "--workers",
         0,
-        "--no-cache",
         "--steps",
         "1,2",
     )
