@@ -272,11 +272,12 @@ def test_a_run_completes_a_recording_with_the_options_of_scans(complete, r2flow,
     drive, dense = tmp_path / "drive.mcap", tmp_path / "dense.mcap"
     assert r2flow("pack", tmp_path / "in", "--rate", 10, "--out", drive).quiet
     options = ["--to", "vlp16", "--size", "32x64"]
-    refused = complete(drive, *options, "--max-error", 1, out=dense)
-    assert "error: this model predicts no errors: leave max_error out" in refused.stderr
-    assert refused.returncode == 2
+    refusal = complete(drive, *options, "--max-error", 1, out=dense).refusal
+    assert "error: this model predicts no errors: leave max_error out" in refusal
     assert not dense.exists()
-    assert "1 of 1 clouds of /points completed" in complete(drive, *options, out=dense).said
+    wrong = complete(drive, "--from", "hdl64e", out=dense)
+    assert wrong.said.startswith(f"{dense}: 1 of 1 clouds of /points completed")
+    assert f"{drive}: sensor hdl64e does not fit these scans" in wrong.stderr
 
 
 def test_two_fields_of_one_name_are_found_before_the_model_runs(complete, tmp_path):

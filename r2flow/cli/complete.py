@@ -254,6 +254,6 @@ def _complete_recording(
         out,
         part.topic,
         part.other_topics,
-        lambda cloud, number: completer(cloud, number, seed),
+        lambda cloud, number: completer.completed(cloud, number, seed, str(path)),
         recipe,
     )

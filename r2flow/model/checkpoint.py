@@ -207,18 +207,19 @@ class Checkpoint:
         sensor: Sensor | str | None,
         keep_beams: bool,
         scale: float | None = None,
+        name: str = IN_MEMORY,
     ) -> "tuple[Checkpoint, Sight]":
-        """This model for the sensor of points in memory, with `keep_beams` in the view that keeps
-        all its beams, and how clouds of it are seen.
+        """This model for the sensor of points, with `keep_beams` in the view that keeps all its
+        beams, and how clouds of it are seen; messages give the points a name.
         """
         source = None if sensor is None else named_sensor(sensor)
-        described = Described(IN_MEMORY, SourceOptions(PLAIN, IN_MEMORY))
+        described = Described(name, SourceOptions(PLAIN, name))
         reading = reading_for([], self, labels=False)
-        found = sight(described, {Path(IN_MEMORY): points}, reading, source, scale, each=True)
+        found = sight(described, {Path(name): points}, reading, source, scale, each=True)
         if keep_beams and found.whole:
-            return self.through(found.whole)._seeing(points, sensor, False, scale)
+            return self.through(found.whole)._seeing(points, sensor, False, scale, name)
         for lost in found.lines[1:]:
-            warnings.warn(lost.removeprefix(f"{IN_MEMORY}: "), stacklevel=4)
+            warnings.warn(lost.removeprefix(f"{name}: "), stacklevel=4)
         return self._without_rows() if found.lines else self, found.see
 
     @property
@@ -252,8 +253,8 @@ class Checkpoint:
             how: Options of `r2flow.model.completion.complete`: sampler, precision, ...
         """
 
-        def decide(points: Points) -> "tuple[Checkpoint, Sight]":
-            return self._seeing(points, sensor, self.keeps_beams, reflectance_scale)
+        def decide(points: Points, name: str) -> "tuple[Checkpoint, Sight]":
+            return self._seeing(points, sensor, self.keeps_beams, reflectance_scale, name)
 
         return Completer(decide, columns, fill_gaps, how)
 

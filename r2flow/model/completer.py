@@ -30,7 +30,7 @@ class Completer:
 
     def __init__(
         self,
-        decide: Callable[[Points], tuple[HasGenerator, Sight]],
+        decide: Callable[[Points, str], tuple[HasGenerator, Sight]],
         columns: Sequence[str] | None,
         fill_gaps: bool,
         how: Mapping[str, Any],
@@ -64,19 +64,18 @@ class Completer:
             InputError: the cloud is no scan of the sensor, or its times or rings contradict it.
         """
         with in_python():
-            whole = self._completed(self._stored(cloud), number, seed)
-        return whole if isinstance(cloud, Cloud) else whole.array()
+            if isinstance(cloud, Cloud):
+                return self.completed(cloud, number, seed)
+            return self.completed(_of_array(cloud, self._columns), number, seed).array()
 
-    def _stored(self, cloud: Cloud | ndarray) -> Cloud:
-        stored = cloud if isinstance(cloud, Cloud) else _of_array(cloud, self._columns)
-        return stored.renamed(self._columns) if stored.named else stored
-
-    def _completed(self, stored: Cloud, number: int, seed: int) -> Cloud:
-        points = points_of(Path(IN_MEMORY), stored.measured())
+    def completed(self, cloud: Cloud, number: int, seed: int, name: str = IN_MEMORY) -> Cloud:
+        """As by a call; errors name the cloud, and options of the command line."""
+        stored = cloud.renamed(self._columns) if cloud.named else cloud
+        points = points_of(Path(name), stored.measured())
         if self._decided is None:
-            self._decided = self._decide(points)
+            self._decided = self._decide(points, name)
         model, see = self._decided
-        given = see(Path(IN_MEMORY), points)
+        given = see(Path(name), points)
         if self._fill_gaps:
             given = gaps_unknown(given)
         (completed,) = complete(
@@ -88,7 +87,7 @@ class Completer:
             **self._how,
         )
         image = completed.images[0].numpy()
-        with naming(IN_MEMORY):
+        with naming(name):
             return completed_cloud(given, image, self.sensor, completed.trust(0))
 
 

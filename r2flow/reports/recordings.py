@@ -81,7 +81,7 @@ def _make_parts(
 ) -> tuple[int, int]:
     """Complete the clouds that no part holds; the numbers of completed clouds and of new points."""
     done = added = 0
-    wrong: InputError | None = None
+    wrong: tuple[int, InputError] | None = None  # of the first cloud that stays as it is
     first: tuple[Cloud, int] | None = None  # of a part
     decided = False  # whether the sensor is, which the first cloud decides for all
     with Bar("completing", count, "clouds") as advance:
@@ -101,13 +101,7 @@ def _make_parts(
                     cloud = complete(scan.cloud, number)
                     data = scan.replaced(cloud)
                 except InputError as error:
-                    if wrong is None:
-                        _log.warning(
-                            "the cloud at %d stays as it is, as others may: %s",
-                            message.recorded,
-                            error,
-                        )
-                    wrong = error
+                    wrong = wrong or (message.recorded, error)
                     advance()
                     continue
                 new = len(cloud) - len(cloud.measured())
@@ -118,7 +112,9 @@ def _make_parts(
             advance()
     if not done:
         shutil.rmtree(store.folder)
-        raise wrong or InputError(f"{recording.path} has no cloud in {topic}.")
+        raise wrong[1] if wrong else InputError(f"{recording.path} has no cloud in {topic}.")
+    if wrong:
+        _log.warning("clouds left as they are: %d; the first, at %d: %s", count - done, *wrong)
     return done, added
 
 
