@@ -19,6 +19,7 @@ python benchmarks/calibration.py --own A B                 # B before and after 
 """
 
 import argparse
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -168,10 +169,13 @@ def fit(names: list[str]) -> Iterator[Path]:
         yield path
 
 
-def cases(name: str, model: Checkpoint, task: str, num: int = 1) -> Iterator[Case]:
+def cases(
+    name: str, model: Checkpoint, task: str, num: int = 1, scans: int | None = None
+) -> Iterator[Case]:
+    """Cases of a sensor's scans, of at most some, evenly spread."""
     paths, reading = scans_of(name)
     flow = model.through(reading.sensor)
-    for path in paths:
+    for path in paths[:: math.ceil(len(paths) / (scans or len(paths)))]:
         yield Case.of(flow, read_image(path, reading), task, 0, num)
 
 
@@ -233,6 +237,8 @@ def main() -> None:
     parser.add_argument("--fit", help="the models to calibrate")
     parser.add_argument("--models", default="densify,densify_small")
     parser.add_argument("--sensors", default=",".join(FILES))
+    parser.add_argument("--tasks", default=" ".join(TASKS))
+    parser.add_argument("--num", type=int, help="at most so many scans of a sensor")
     parser.add_argument("--drawn", type=int, help="number of drawn answers")
     parser.add_argument("--kept", action="store_true")
     parser.add_argument("--own", nargs=2, type=Path, help="scans to calibrate on, scans to judge")
@@ -253,8 +259,8 @@ def main() -> None:
                 print(*line, flush=True)
             continue
         for sensor in args.sensors.split(","):
-            for task in TASKS:
-                found = cases(sensor, model, task, args.drawn or 1)
+            for task in args.tasks.split():
+                found = cases(sensor, model, task, args.drawn or 1, args.num)
                 if args.drawn:
                     each = [
                         spread_errors(c.truth, c.completed.images.numpy(), c.hidden) for c in found

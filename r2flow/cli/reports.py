@@ -246,6 +246,6 @@ def calibrate(
     trust = calibrate_sensor(flow, real, sensor, num, reflectance_scale)
     (first, second), (near, far) = trust.factors, trust.shares
     print(
-        f"{trust.points:,} added points: {near:.1%} within error_68, {far:.1%} within error_95; "
-        f"error_factors [{first:.3f}, {second:.3f}] in {sensor}"
+        f"{trust.points:,} added points: {near:.1%} within error_68, {far:.1%} within error_95 so "
+        f"far; error_factors [{first:.3f}, {second:.3f}] in {sensor}"
     )

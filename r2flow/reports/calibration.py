@@ -30,7 +30,9 @@ _FEWEST = 1000  # added points that a quantile of 95 % needs at least
 
 
 class Trust(NamedTuple):
-    """Factors for a sensor, and the shares of added points within both errors without them."""
+    """Factors for a sensor, and the shares of added points within both errors with those that its
+    file had.
+    """
 
     factors: tuple[float, float]
     shares: tuple[float, float]
@@ -80,7 +82,7 @@ def trust_of(model: Checkpoint, truths: Sequence[ndarray], progress: Progress = 
     first, second = (
         float(np.partition(one, rank)[rank]) for one, rank in zip(scores, ranks, strict=True)
     )
-    within = (scores <= 1).mean(1).tolist()
+    within = (scores.T <= (model.sensor.error_factors or 1)).mean(0).tolist()
     return Trust((first, second), (within[0], within[1]), count)
 
 
