@@ -1,5 +1,6 @@
 """Clouds in memory are completed with all their fields, as the command line completes files."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 import r2flow
 from r2flow.base.errors import InputError
 from r2flow.lidar.scan_files import Cloud, read_cloud, write_cloud
-from r2flow.lidar.sensors import SENSORS
+from r2flow.lidar.sensors import SENSORS, Sensor
 
 KINDS = [
     ("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "u1"), ("ring", "u2"), ("t", ">u8"),
@@ -79,6 +80,25 @@ def test_the_rows_of_measured_points_are_those_of_their_beams(completed):
     measured = completed[completed["measured"] == 1]
     # beam b from the top, in the upper part of the view, is row 2 b + 1 of twice as many
     assert np.array_equal(measured["image_row"], 2 * (15 - measured["ring"].astype(int)) + 1)
+
+
+def test_rows_of_added_points_are_rings_of_the_points_that_were_hidden(flow):
+    """An uneven sensor in a round room: every 2nd of its beams is hidden, and filled in again."""
+    gaps = 0.6 + np.random.default_rng(0).random(24)
+    sensor = Sensor("uneven", tuple((12 - np.cumsum(gaps)).round(3)), columns=256)
+    ring, fired = np.divmod(np.arange(24 * 256), 256)
+    a = np.pi * (1 - (2 * fired + 1) / 256)
+    z = 9 * np.tan(np.radians(sensor.elevations)[ring])
+    rows = np.zeros(len(ring), [(name, "f4") for name in "xyz"] + [("ring", "u2")])
+    rows["x"], rows["y"], rows["z"], rows["ring"] = 9 * np.cos(a), 9 * np.sin(a), z, ring
+    known = replace(sensor, name="known", elevations=sensor.elevations[::2])
+    whole = flow.through(sensor).completer(known)(rows[ring % 2 == 0])
+    added = whole[whole["measured"] == 0]
+    assert len(added) > 0.9 * 11 * 256
+    e = np.degrees(np.arctan2(added["z"], np.hypot(added["x"], added["y"])))
+    truth = 2 * abs(e[:, None] - sensor.elevations[1::2]).argmin(1) + 1
+    assert np.array_equal(added["image_row"], truth)
+    assert np.array_equal(added["ring"], truth)
 
 
 def test_added_points_are_not_taken_for_measured_ones(flow, completed):
