@@ -109,6 +109,7 @@ def test_a_file_of_ids_reads_a_list_of_the_user(tmp_path, nested):
         ("car: 1", "an id is a whole number; found 'car'"),
         ("[1, 2]", "not a list of ids"),
         ("a: &a {1: car}\nlabels: *a", "aliases"),
+        ("1: car\n9: road\n1: building", "it has the key '1' 2 times"),
     ],
 )
 def test_a_file_of_ids_that_is_none_is_refused(tmp_path, text, said):

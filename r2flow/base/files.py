@@ -6,6 +6,7 @@ import json
 import os
 import re
 import secrets
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import IO, Any
 import numpy as np
 import yaml
 
-from r2flow.base.errors import InputError, check, naming
+from r2flow.base.errors import InputError, check, naming, quoted
 
 # Names of `atomic_write`'s temporary files and of `Store`'s locks.
 _LEFTOVER = re.compile(r"\..+\.[0-9a-f]{8}\.part|\..+-\d{6}\.lock", re.DOTALL)
@@ -135,12 +136,22 @@ def parse_yaml(text: str, most_aliases: int = 0) -> Any:
     """Plain values of a YAML document.
 
     Raises:
-        InputError: it has more aliases; nested ones can stand for any size.
+        InputError: it has more aliases, as nested ones can stand for any size, or a key twice.
     """
     aliases = sum(isinstance(token, yaml.AliasToken) for token in yaml.scan(text))
     few = aliases <= most_aliases
     check(few, "it has aliases (*NAME), which can stand for any size: write them out.")
-    return yaml.safe_load(text)
+    return yaml.load(text, _OneOfEachKey)
+
+
+class _OneOfEachKey(yaml.SafeLoader):
+    """YAML lets the last of equal keys win; here they are an error."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        counts = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        for name, count in counts.items():
+            check(count == 1, f"it has the key {quoted(name)} {count} times.")
+        return super().construct_mapping(node, deep)
 
 
 @contextmanager
