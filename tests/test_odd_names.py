@@ -106,6 +106,6 @@ def test_a_newline_in_a_name_does_not_eat_the_line():
 def test_names_in_results_do_not_control_the_terminal():
     raw = io.BytesIO()
     stream = Harmless(raw, "utf-8", line_buffering=True)
-    stream.write("a\033]0;title\007b\033[2Jc\x9b5nd\033[1mbold\033[0m ä\t\n")
-    plain = r"a\x1b]0;title\x07b\x1b[2Jc\x9b5nd" + "\033[1mbold\033[0m ä\t\n"
+    stream.write("a\033]0;title\007b\033[2Jc\x9b5nd\033[1mbold\033[0m ä\t\u202egnp.bin\n")
+    plain = r"a\x1b]0;title\x07b\x1b[2Jc\x9b5nd" + "\033[1mbold\033[0m ä\t\\u202egnp.bin\n"
     assert raw.getvalue().decode() == plain

@@ -153,8 +153,10 @@ class Unbroken(io.FileIO):
             return len(data)
 
 
-# Of names, in results: sequences that a terminal obeys, but for rich's colours.
-_OBEYED = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1a\x1c-\x1f\x7f-\x9f]|\x1b(?!\[[\d;]*m)")
+# Of names, in results: sequences that a terminal obeys, but for rich's colours; marks of direction.
+_OBEYED = re.compile(
+    r"[\x00-\x08\x0b\x0c\x0e-\x1a\x1c-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]|\x1b(?!\[[\d;]*m)"
+)
 
 
 class Harmless(io.TextIOWrapper):
