@@ -196,12 +196,16 @@ def choose_topic(recording: Recording, topic: str | None) -> str:
     found = [name for name in readable if topic in (None, name)]
     if len(found) == 1:
         return found[0]
-    check(not readable, f"give one of its topics of point clouds by --topic: {_join(readable)}.")
+    if readable:
+        raise InputError(
+            f"{recording.path}: give one of its topics of point clouds by --topic: "
+            f"{_join(readable)}."
+        )
     clouds = [channel for channel in channels if "cloud" in channel.kind.lower()]
     listed = [f"{one.topic} ({one.kind}, encoding {one.encoding})" for one in clouds or channels]
     raise InputError(
-        f"it holds no {CLOUD} in the encodings {_join(ENCODINGS)}, but {_join(listed)}. "
-        f"{_OTHER_CLOUDS}"
+        f"{recording.path} holds no {CLOUD} in the encodings {_join(ENCODINGS)}, but "
+        f"{_join(listed)}. {_OTHER_CLOUDS}"
     )
 
 

@@ -120,6 +120,7 @@ def test_unpack_writes_files_that_every_verb_reads(r2flow, tmp_path: Path):
     file = record(tmp_path / "drive", "MCAP", ("/front", "/rear"), stamps=(1, 1, 2))
     out = tmp_path / "scans"
     line = r2flow("unpack", file, "--out", out).refusal
+    assert line.count(str(file)) == 1
     assert "give one of its topics of point clouds by --topic: /front, /rear" in line
     assert r2flow("unpack", file, "--topic", "/rear", "--out", out) == (
         0,
