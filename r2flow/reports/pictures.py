@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.artist import Artist, allow_rasterization
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import ListedColormap, Normalize, to_hex, to_rgb
+from matplotlib.colors import ListedColormap, Normalize, to_hex, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.image import BboxImage
 from matplotlib.patches import Patch
@@ -18,6 +18,7 @@ from torch import Tensor
 from r2flow.lidar.labels import CLASSES, semantic_ids
 from r2flow.lidar.projection import image_to_points
 
+_MOST_CLASSES = 10  # of a legend
 _WIDTH = 7.16  # inches: two columns of an IEEE paper
 # Camera of the perspective over a street, in units of the view's reach.
 _EYE = np.array([-0.32, 0.0, 0.18])
@@ -99,7 +100,7 @@ def scan_figure(
     )
     view = view or view_of((image, rays))
     _draw_strips([figure.add_subplot(grid[row, :]) for row in range(strips)], image, labels, view)
-    _draw_views([figure.add_subplot(grid[-1, i]) for i in (0, 1)], image, rays, view)
+    _draw_views([figure.add_subplot(grid[-1, i]) for i in (0, 1)], image, rays, view, labels=labels)
     returned = image[0] > 0
     size = " x ".join(map(str, returned.shape))
     about = f"{title}   {size}, {returned.sum():,} returns ({returned.mean():.0%})".strip()
@@ -147,7 +148,7 @@ def contact_sheet(
         title = titles[row] if row < len(titles) else ""
         _draw_strips(strips, image, ids, view, title, row == 0)
         views = [figure.add_subplot(grid[row, i]) for i in (1, 2)]
-        _draw_views(views, image, rays, view, row == 0)
+        _draw_views(views, image, rays, view, row == 0, ids)
         if row == 0 and unmeasured is not None:
             white = np.repeat(unmeasured[..., None], 4, axis=2).astype(float)
             for axes in strips[: len(image)]:
@@ -200,15 +201,20 @@ def _draw_values(
 
 def _draw_labels(axes: Any, labels: np.ndarray) -> None:
     """Draw semantic ids with a legend of the classes."""
-    classes = class_colours(labels[labels > 0], most=10)
-    colour = np.zeros((*labels.shape, 3))
-    for number, (_, value) in classes.items():
-        colour[labels == number] = to_rgb(value)
-    axes.imshow(colour, aspect="auto", interpolation="nearest")
+    classes = class_colours(labels[labels > 0], _MOST_CLASSES)
+    axes.imshow(_in_class_colours(labels, "black")[..., :3], aspect="auto", interpolation="nearest")
     trusted = classes.keys() & TRUST.keys()
     black = {"no return": "black"} if trusted else {}
     _add_legend(axes, {**dict(classes.values()), **black})
-    _frame(axes, TRUST_TITLE if trusted else "label", "black")
+    _frame(axes, TRUST_TITLE if trusted else "class", "black")
+
+
+def _in_class_colours(labels: np.ndarray, other: str) -> np.ndarray:
+    """RGBA of semantic ids, (..., 4) in [0, 1]; `other`: of those that the legend leaves out."""
+    colour = np.full((*labels.shape, 4), to_rgba(other))
+    for number, (_, value) in class_colours(labels[labels > 0], _MOST_CLASSES).items():
+        colour[labels == number] = to_rgba(value)
+    return colour
 
 
 def class_colours(labels: np.ndarray, most: int) -> dict[int, tuple[str, str]]:
@@ -228,29 +234,43 @@ def class_colours(labels: np.ndarray, most: int) -> dict[int, tuple[str, str]]:
 
 
 def _draw_views(
-    panels: Sequence[Any], image: np.ndarray, rays: Tensor, view: View, first: bool = True
+    panels: Sequence[Any],
+    image: np.ndarray,
+    rays: Tensor,
+    view: View,
+    first: bool = True,
+    labels: np.ndarray | None = None,
 ) -> None:
     """Draw points from above, driving direction upwards, and by a pinhole camera behind and above
-    the sensor, coloured by height.
+    the sensor, coloured by class if `labels` are semantic ids, else by height.
     """
     above, ahead = panels
     reach = view.reach
+    heights = ScalarMappable(Normalize(*view.heights), "turbo")
     points, _ = image_to_points(image, rays)
-    x, y, z = points[(np.abs(points[:, :2]) < reach).all(axis=1)].T
-    _draw_points(above, -y, x, z, np.clip(6_000 / max(len(x), 1), 0.2, 1.0), view)
+    colour = heights.to_rgba(points[:, 2], bytes=True)
+    title = "perspective, colour: height, m" if first else ""
+    by_class = labels is not None and not np.isin(labels, list(TRUST)).any()
+    if labels is not None and by_class:
+        colour = (255 * _in_class_colours(labels[image[0] > 0], "0.8")).astype(np.uint8)
+        title = "perspective, colour: class"
+    near = (np.abs(points[:, :2]) < reach).all(axis=1)
+    size = np.full(near.sum(), np.clip(6_000 / max(near.sum(), 1), 0.2, 1.0))
+    above.add_artist(_Dots(points[near][:, :2] @ [[0, 1], [-1, 0]], colour[near], size))
     above.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
     above.plot(0, 0, marker="^", color="black", ms=3)
     _frame(above, f"bird's-eye view, {2 * reach:.0f} m" if first else "")
 
     eye = _EYE * (1 if reach > _ROOM else 4)
-    seen = np.column_stack([(points / reach - eye) @ _AXES, points[:, 2]])
-    seen = seen[seen[:, 2] > 0.06]
-    x, y, depth, z = seen[np.argsort(-seen[:, 2])].T
+    seen = (points / reach - eye) @ _AXES
+    order = np.argsort(-seen[:, 2])
+    order = order[seen[order, 2] > 0.06]
+    place, depth = seen[order, :2], seen[order, 2]
     size = np.clip(0.14 / depth, 0.3, 0.8) * np.sqrt(30_000 / max(len(points), 1))
-    heights = _draw_points(ahead, x / depth, y / depth, z, size, view)
+    ahead.add_artist(_Dots(place / depth[:, None], colour[order], size))
     ahead.set(xlim=(-0.95, 0.95), ylim=(-0.62, 0.48), aspect="equal")
-    _frame(ahead, "perspective, colour: height, m" if first else "")
-    if first:
+    _frame(ahead, title)
+    if first and not by_class:
         low, high = view.heights
         _add_bar(ahead, heights, {z: z for z in (low, (low + high) / 2, high)})
 
@@ -283,15 +303,6 @@ class _Dots(Artist):
         column, row = places[:, seen]
         pixels[row, column] = self.colours[seen.nonzero()[0]]
         renderer.draw_image(renderer.new_gc(), x, y, pixels)
-
-
-def _draw_points(
-    axes: Any, x: np.ndarray, y: np.ndarray, z: np.ndarray, size: Any, view: View
-) -> ScalarMappable:
-    heights = ScalarMappable(Normalize(*view.heights), "turbo")
-    sizes = np.broadcast_to(size, x.shape)
-    axes.add_artist(_Dots(np.column_stack([x, y]), heights.to_rgba(z, bytes=True), sizes))
-    return heights
 
 
 @cache

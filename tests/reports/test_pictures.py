@@ -1,9 +1,11 @@
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgba
 
+from r2flow.lidar.labels import CLASSES
 from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.figures import figure_pixels, save_figure
-from r2flow.reports.pictures import STREET, contact_sheet, scan_figure, trust_ids
+from r2flow.reports.pictures import STREET, _Dots, contact_sheet, scan_figure, trust_ids
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
 E, A = SENSOR.rays().numpy()
@@ -62,6 +64,11 @@ def test_classes_of_labelled_scans_have_a_strip_and_a_legend():
     figure = contact_sheet([scan, road], SENSOR.rays())
     (axes,) = [axes for axes in figure.axes if axes.get_legend()]
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["road"]
+    dots = [one for axes in figure.axes for one in axes.get_children() if isinstance(one, _Dots)]
+    colours = np.array([to_rgba("0.8"), to_rgba(CLASSES[40][1])])[(E < 0).ravel().astype(int)]
+    np.testing.assert_allclose(dots[2].colours / 255, colours, atol=1 / 255)  # from above
+    titles = [axes.get_title("left") for axes in figure.axes]
+    assert titles.count("perspective, colour: class") == 1
     assert np.array_equal(axes.images[0].get_array().any(2), E < 0)
 
 
