@@ -272,7 +272,7 @@ def test_only_what_is_there_can_be_coloured(opened):
     # 0.9 of 5.32 m (2 %), 1.1 of 30.28 m (98 %), and the root of their product between
     assert shown.locator("#legend span").all_inner_texts() == ["range 4.8 m", "13 m", "33 m"]
     shown = opened(panel(lone(), labels=np.full((1, *SENSOR.shape), 40)))
-    colour_by(shown, "label")
+    settle(shown)  # labels are shown first
     assert shown.locator("#legend span").all_inner_texts() == ["road", "no class"]
     box, point = shown.locator(".points").bounding_box(), points_of(lone())[6, 35]
     x, y = projected(point, camera_of(shown), box)

@@ -13,7 +13,7 @@ const COARSE = 5; // draw every n-th point; not a divisor of usual numbers of co
 
 const nameOf = (mode) => (mode === "label" ? page.kind : mode);
 
-const state = { mode: page.shown.label && page.kind === "label" ? "label" : MODES[0], size: 0, frame: 0, first: 0, alone: null, picked: null, playing: false };
+const state = { mode: page.shown.label && page.kind === "label" ? "label" : "height", size: 0, frame: 0, first: 0, alone: null, picked: null, playing: false };
 const camera = { target: [0, 0, 0], yaw: Math.PI, pitch: 0.42, distance: 30 };
 
 
@@ -811,7 +811,7 @@ async function start() {
   }
   prepare();
   page.scans.forEach(buildTile);
-  setMode("height");
+  setMode(state.mode);
   canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
   canvas.addEventListener("webglcontextrestored", () => {
     into = null;
