@@ -94,15 +94,18 @@ def type_store(encoding: str) -> Any:
 
 
 def cloud_of(path: Path, message: Any) -> Cloud:
-    """All fields of a PointCloud2 that lie within its points; a line names the others.
+    """All named fields of a PointCloud2 that lie within its points; a line names the others.
 
     Raises:
         InputError: Its sizes contradict each other.
     """
-    fields = [field for field in message.fields if _lies_within(field, message.point_step)]
+    fields = [field for field in message.fields if _is_whole(field, message.point_step)]
     if left := [field for field in message.fields if field not in fields]:
-        named = ", ".join(f"{field.name} (datatype {field.datatype})" for field in left)
-        warn_odd(path, f"fields that are not within a point are left out: {named[:120]}")
+        named = ", ".join(f"{field.name!r} (datatype {field.datatype})" for field in left)
+        warn_odd(
+            path,
+            f"fields without a name, or not within a point, are left out: {named[:120]}",
+        )
     order = ">" if message.is_bigendian else "<"
     point = np.dtype(
         {
@@ -130,9 +133,13 @@ def cloud_of(path: Path, message: Any) -> Cloud:
     )
 
 
-def _lies_within(field: Any, step: int) -> bool:
+def _is_whole(field: Any, step: int) -> bool:
     kind = _KINDS.get(field.datatype)
-    return kind is not None and field.offset + int(kind[1]) * max(field.count, 1) <= step
+    return (
+        bool(field.name)
+        and kind is not None
+        and field.offset + int(kind[1]) * max(field.count, 1) <= step
+    )
 
 
 def _serialized(message: Any, cloud: Cloud, encoding: str) -> bytes:

@@ -112,14 +112,17 @@ def test_fields_of_one_name_are_refused_and_overlapping_ones_kept():
         cloud_of(Path("a"), twice).array()
 
 
-@pytest.mark.parametrize(("datatype", "offset"), [(0, 0), (9, 0), (7, 10**6)])
-def test_fields_outside_a_point_are_left_out_with_a_line(tmp_path, caplog, datatype, offset):
+@pytest.mark.parametrize(
+    ("name", "datatype", "offset"),
+    [("spare", 0, 0), ("spare", 9, 0), ("spare", 7, 10**6), ("", 7, 0)],
+)
+def test_fields_outside_a_point_are_left_out_with_a_line(tmp_path, caplog, name, datatype, offset):
     message = decoded(written(Cloud.of(rows(9)), 0, "", "cdr"))
-    spare = replace(message.fields[0], name="spare", datatype=datatype, offset=offset)
+    spare = replace(message.fields[0], name=name, datatype=datatype, offset=offset)
     cloud = cloud_of(tmp_path / "a", replace(message, fields=[*message.fields, spare]))
     assert cloud.array()["y"].tobytes() == rows(9)["y"].tobytes()
-    assert "spare" not in cloud.names
-    assert f"spare (datatype {datatype})" in caplog.text
+    assert name not in cloud.names
+    assert f"{name!r} (datatype {datatype})" in caplog.text
 
 
 def test_half_of_the_data_is_one_line():
