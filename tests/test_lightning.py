@@ -119,6 +119,32 @@ def test_a_run_resumed_anywhere_ends_with_the_same_bits(tmp_path: Path, stopped_
         assert torch.equal(value, ended(second)[name]), name
 
 
+@pytest.mark.parametrize(("before", "after"), [(1, 4), (4, 2)])
+def test_a_run_resumed_with_other_parts_of_a_batch_sees_the_same_images(tmp_path, before, after):
+    seen: list[int] = []
+
+    class Recorder(L.Callback):
+        def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx):
+            seen.extend(batch["k"].tolist())
+
+    keep = ModelCheckpoint(tmp_path, every_n_train_steps=3, monitor=None, filename="kept")
+    first = quiet_trainer(
+        tmp_path, max_steps=7, callbacks=[Recorder(), keep, StopAfter(3)], enable_checkpointing=True,
+        accumulate_grad_batches=before,
+    )  # fmt: skip
+    first.fit(flow(), scans())
+    second = quiet_trainer(
+        tmp_path, max_steps=7, callbacks=[Recorder()], accumulate_grad_batches=after
+    )
+    second.fit(flow(), scans(), ckpt_path=tmp_path / "kept.ckpt")
+    whole = quiet_trainer(tmp_path, max_steps=7)
+    whole.fit(flow(), scans())
+    assert seen == list(range(7 * 4))
+    assert (second.global_step, second.current_epoch) == (whole.global_step, whole.current_epoch)
+    for name, value in ended(whole).items():
+        torch.testing.assert_close(ended(second)[name], value, rtol=0, atol=2e-6)  # 2.8e-7 seen
+
+
 class StopAfter(L.Callback):
     def __init__(self, step: int) -> None:
         self.step = step

@@ -80,7 +80,7 @@ class TrainerOptions:
     enable_checkpointing: bool
     enable_progress_bar: Free[bool]
     enable_model_summary: bool
-    accumulate_grad_batches: Count
+    accumulate_grad_batches: Free[Count]
     gradient_clip_val: NonNegative | None
     gradient_clip_algorithm: Literal["norm", "value"] | None
     deterministic: bool | Literal["warn"] | None

@@ -6,12 +6,14 @@ import math
 from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import asdict
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, TypedDict
 
 import lightning as L
 import torch
+from lightning.pytorch.callbacks import GradientAccumulationScheduler
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
@@ -51,6 +53,7 @@ _BEYOND = 1.1  # largest value of a scan in model space, with some tolerance
 
 _FEW = 32  # held-out scans: a test of fewer is called chance
 
+_PARTS = "accumulate_grad_batches"  # in a checkpoint
 _log = logging.getLogger(__name__)
 
 Batch = dict[str, Tensor]
@@ -482,6 +485,22 @@ class Stage(L.LightningModule, NamedArguments):
             "total_steps": self.total_steps if self._trainer else None,
             **self.generator.drawing(),
         }
+        if self._trainer:
+            checkpoint[_PARTS] = self._trainer.accumulate_grad_batches
+
+    def on_load_checkpoint(self, checkpoint: Config) -> None:
+        """Count the parts of batches so far in those of now, which a resumed run may change."""
+        trainer: Any = self._trainer
+        if not trainer or not {_PARTS, "loops"} <= checkpoint.keys():
+            return
+        if any(isinstance(one, GradientAccumulationScheduler) for one in trainer.callbacks):
+            return
+        ratio = Fraction(trainer.accumulate_grad_batches, checkpoint[_PARTS])
+        progress = checkpoint["loops"]["fit_loop"]["epoch_loop.batch_progress"]
+        for counts in (progress["total"], progress["current"]):
+            late = counts["processed"] - counts["completed"]  # 1: saved by a callback after a batch
+            counts.update({key: int(count * ratio) for key, count in counts.items()})
+            counts["completed"] = counts["processed"] - late
 
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
         """Load weights; with `strict`, those that do not fit are refused in one line."""
