@@ -324,7 +324,11 @@ def _swept(returned: Tensor, steps: Tensor, turning: bool, ring: bool) -> Tensor
     squares = torch.empty_like(moved[:, 0])
     best = torch.empty_like(moved[0])
     nearer = torch.empty_like(squares[0], dtype=torch.bool)
+    # Views are made once: made for each row, they are a quarter of the search.
     inner = previous[1]
+    before, same, after = moved
+    square_before, square_same, square_after = squares
+    down, across = angles.unbind(1)
     zero = steps.new_zeros(())
     left, first, last, right = (wide[..., k] for k in (0, 1, -2, -1))
     start = states[0].clone()
@@ -338,12 +342,12 @@ def _swept(returned: Tensor, steps: Tensor, turning: bool, ring: bool) -> Tensor
             torch.add(previous, moves, out=moved)
             torch.mul(moved, steps, out=angles)
             angles.square_()
-            torch.add(angles[:, 0], angles[:, 1], out=squares)
-            torch.lt(squares[1], squares[0], out=nearer)
-            torch.where(nearer, moved[1], moved[0], out=best)
-            torch.minimum(squares[0], squares[1], out=squares[0])
-            torch.lt(squares[2], squares[0], out=nearer)
-            torch.where(nearer, moved[2], best, out=following)
+            torch.add(down, across, out=squares)
+            torch.lt(square_same, square_before, out=nearer)
+            torch.where(nearer, same, before, out=best)
+            torch.minimum(square_before, square_same, out=square_before)
+            torch.lt(square_after, square_before, out=nearer)
+            torch.where(nearer, after, best, out=following)
         start = states[-1].roll(1, 2)
         if not turning:
             start[:, :, 0] = math.inf
