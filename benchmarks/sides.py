@@ -1,28 +1,39 @@
 """Two checkouts side by side: processor seconds of one thread and peak memory of users' work.
 
-Each run of a case is a process of its own, of the checkouts in turns; a run gives the median of its
-repetitions, the table the medians over the runs. Scans are simulated.
+Each checkout has a process for a case. They work in turns, one repetition each; the table has the
+medians. Scans are simulated. `stream` less `stream_named` is what finding the sensor takes. Of
+commands, `first` and `drive`, seconds and memory are those of their processes, start included.
 
 git worktree add ../before main
-python benchmarks/sides.py ../before . --runs 5
+python benchmarks/sides.py ../before . --repeats 7
 python benchmarks/sides.py ../before . --cases vlp16,street
 python benchmarks/sides.py . . --models densify,densify_small --cases vlp16,hdl64e,os1_128
+python benchmarks/sides.py ../before . --avx2   # float32 as on a core without AVX-512 and bfloat16
 """
 
 import argparse
-import json
 import os
 import resource
 import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from numpy import ndarray
 
 Work = Callable[[], object]
 MODEL = "SIDES_MODEL"  # environment variable: the model that completes
+PRECISION = "SIDES_PRECISION"  # and that of its network, where it is not the usual one
+AVX2 = {
+    "ONEDNN_MAX_CPU_ISA": "AVX2",
+    "ATEN_CPU_CAPABILITY": "avx2",
+    PRECISION: "32-true",
+}
+HOW: Any = {"precision": os.environ[PRECISION]} if PRECISION in os.environ else {}
 
 
 def completing(sensor: str, size: tuple[int, int] | None, keep: int) -> Work:
@@ -41,23 +52,62 @@ def completing(sensor: str, size: tuple[int, int] | None, keep: int) -> Work:
     measured = torch.zeros(flow.sensor.shape, dtype=torch.bool)
     measured[::keep] = True
     state = ray_states(images, measured)
-    return lambda: flow.complete(images * measured, state)
+    return lambda: flow.complete(images * measured, state, **HOW)
 
 
-def points() -> Work:
-    """Completion of a VLP-16's points in memory to 64 x 1024."""
+def cloud(seed: int = 1) -> "ndarray":
+    """A scan of a VLP-16, (N, 4) float32."""
     import numpy as np
 
-    import r2flow
     from r2flow.lidar.projection import image_to_points
     from r2flow.lidar.sensors import SENSORS
     from r2flow.simulator import simulate
 
     sensor = SENSORS["vlp16"].resized(16, 1800)
-    xyz, strength = image_to_points(simulate(sensor, 1, 0).image, sensor)
-    cloud = np.column_stack([xyz, strength])
+    return np.column_stack(image_to_points(simulate(sensor, seed, 0).image, sensor))
+
+
+def points() -> Work:
+    """Completion of a VLP-16's points in memory to 64 x 1024."""
+    import r2flow
+
     flow = r2flow.load(os.environ[MODEL])
-    return lambda: flow.complete(cloud, sensor="vlp16")
+    scan = cloud()
+    return lambda: flow.complete(scan, sensor="vlp16", **HOW)
+
+
+def stream(sensor: str | None) -> Work:
+    """Completion of one scan of a VLP-16 after another: by a `completer`, if the checkout has it."""
+    import r2flow
+
+    flow = r2flow.load(os.environ[MODEL])
+    scan = cloud()
+    if hasattr(flow, "completer"):
+        completer = flow.completer(sensor, **HOW)
+        return lambda: completer(scan)
+    return lambda: flow.complete(scan, sensor=sensor, **HOW)
+
+
+def command(count: int, threads: str, *words: str) -> Work:
+    """`r2flow complete` of `count` files of a VLP-16."""
+    folder = Path(tempfile.mkdtemp())
+    scan = cloud()
+    for number in range(count):
+        scan.astype("<f4").tofile(folder / f"{number:03}.bin")
+    environment = {**os.environ, "OMP_NUM_THREADS": threads}
+    program = (sys.executable, "-W", "ignore", "-m", "r2flow")
+    how = [word for value in HOW.values() for word in ("--precision", value)]
+
+    def work() -> None:
+        with tempfile.TemporaryDirectory() as out:
+            subprocess.run(
+                [*program, "complete", folder, *words, *how, "--out", f"{out}/dense"],
+                env=environment,
+                stdout=subprocess.DEVNULL,
+                check=True,
+            )
+
+    return work
 
 
 def sampling(precision: str) -> Work:
@@ -107,6 +157,10 @@ def pictures() -> Work:
 
 CASES: dict[str, Callable[[], Work]] = {
     "vlp16": points,
+    "stream": lambda: stream(None),
+    "stream_named": lambda: stream("vlp16"),
+    "first": lambda: command(1, "1"),
+    "drive": lambda: command(100, "2", "-c", os.environ[MODEL]),
     "hdl64e": lambda: completing("hdl64e", None, 4),
     "os1_128": lambda: completing("os1_128", (128, 1024), 4),
     "street": lambda: sampling("32-true"),
@@ -119,21 +173,40 @@ CASES: dict[str, Callable[[], Work]] = {
 }
 
 
-def run(case: str, repeats: int) -> dict[str, float]:
-    """Processor seconds of a repetition after the first, and MiB at the peak above the start."""
+COMMANDS = ("first", "drive")
+
+
+def run(case: str) -> None:
+    """A repetition for each line of input: processor seconds, and MiB at the peak above the start."""
     import torch
 
     torch.set_num_threads(1)
     work = CASES[case]()
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    work()
-    seconds = []
-    for _ in range(repeats):
-        start = time.process_time()
+    of = resource.RUSAGE_CHILDREN if case in COMMANDS else resource.RUSAGE_SELF
+    before = resource.getrusage(of)
+    for _ in sys.stdin:
+        start = resource.getrusage(of)
         work()
-        seconds.append(time.process_time() - start)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return {"seconds": statistics.median(seconds), "memory": (peak - before) / 1024}
+        end = resource.getrusage(of)
+        seconds = end.ru_utime + end.ru_stime - start.ru_utime - start.ru_stime
+        print(seconds, (end.ru_maxrss - before.ru_maxrss) / 1024, flush=True)
+
+
+def begun(checkout: Path, case: str, **environment: str) -> subprocess.Popen[str]:
+    """The process of a checkout for a case."""
+    command = [sys.executable, "-W", "ignore", __file__, "--run", case]
+    own = {"PYTHONPATH": str(checkout.resolve()), "OMP_NUM_THREADS": "1", **environment}
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, env={**os.environ, **own}, stdin=pipe, stdout=pipe, text=True)
+
+
+def repeated(process: subprocess.Popen[str]) -> list[float]:
+    """Seconds and MiB of a repetition."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    process.stdin.write("\n")
+    process.stdin.flush()
+    return [float(word) for word in process.stdout.readline().split()]
 
 
 def main() -> None:
@@ -143,37 +216,27 @@ def main() -> None:
     parser.add_argument("checkouts", nargs="*", type=Path)
     parser.add_argument("--cases", default=",".join(CASES))
     parser.add_argument("--models", default="densify,densify", help="of the two, to complete")
-    parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--avx2", action="store_true")
     parser.add_argument("--run", help=argparse.SUPPRESS)  # of a process for one case
     given = parser.parse_args()
     if given.run:
-        print(json.dumps(run(given.run, given.repeats)))
-        return
+        return run(given.run)
     print(
         "| work | before, s | after, s | ratio | before, MiB | after, MiB |\n|---|---|---|---|---|---|"
     )
     for case in given.cases.split(","):
-        found: list[list[dict[str, float]]] = [[] for _ in given.checkouts]
-        for _ in range(given.runs):
-            models = given.models.split(",")
-            for checkout, model, results in zip(given.checkouts, models, found, strict=True):
-                command = [sys.executable, "-W", "ignore", __file__, "--run", case]
-                done = subprocess.run(
-                    [*command, "--repeats", str(given.repeats)],
-                    env={
-                        **os.environ,
-                        "PYTHONPATH": str(checkout.resolve()),
-                        "OMP_NUM_THREADS": "1",
-                        MODEL: model,
-                    },
-                    stdout=subprocess.PIPE,
-                    check=True,
-                )
-                results.append(json.loads(done.stdout.splitlines()[-1]))
-        (a, b), (m, n) = (
-            [statistics.median(one[key] for one in results) for results in found]
-            for key in ("seconds", "memory")
+        each = zip(given.checkouts, given.models.split(","), strict=True)
+        isa = AVX2 if given.avx2 else {}
+        sides = [begun(checkout, case, **isa, **{MODEL: model}) for checkout, model in each]
+        for side in sides if case not in COMMANDS else ():
+            repeated(side)  # the first one reserves memory
+        rounds = [[repeated(side) for side in sides] for _ in range(given.repeats)]
+        for side in sides:
+            side.communicate()
+        (a, m), (b, n) = (
+            map(statistics.median, zip(*results, strict=True))
+            for results in zip(*rounds, strict=True)
         )
         print(f"| {case} | {a:.3f} | {b:.3f} | {b / a:.2f} | {m:.0f} | {n:.0f} |", flush=True)
 
