@@ -79,24 +79,6 @@ def invert(
     )
 
 
-def round_trip(checkpoint: Checkpoint, inversion: Inversion) -> dict[str, Tensor]:
-    """Errors of scans after inversion and generation, each (B,); NaN for scans that are not finite.
-
-    `rms` in model space, [-1, 1]; `median_m`, `rms_m` and `dropped` of `metres_apart`; `noise_std`,
-    the standard deviation of x_0, far from 1 for scans unlike the training set.
-    """
-    decode = checkpoint.encoding.decode
-    error = rms(inversion.again - inversion.x_1)
-    median_m, rms_m, dropped = metres_apart(decode(inversion.x_1), decode(inversion.again))
-    return {
-        "rms": error,
-        "median_m": median_m,
-        "rms_m": rms_m,
-        "dropped": dropped.masked_fill(error.isnan(), math.nan),
-        "noise_std": inversion.x_0.double().flatten(1).std(1),
-    }
-
-
 def rms(x: Tensor) -> Tensor:
     """Root mean square over each scan's elements, (B, ...) -> (B,), float64."""
     return x.double().square().flatten(1).mean(1).sqrt()

@@ -82,7 +82,7 @@ def trust_of(model: Checkpoint, truths: Sequence[ndarray], progress: Progress = 
     first, second = (
         float(np.partition(one, rank)[rank]) for one, rank in zip(scores, ranks, strict=True)
     )
-    within = (scores.T <= (model.sensor.error_factors or 1)).mean(0).tolist()
+    within = ((model.sensor.error_factors or 1) >= scores.T).mean(0).tolist()
     return Trust((first, second), (within[0], within[1]), count)
 
 

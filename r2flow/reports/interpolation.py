@@ -12,7 +12,7 @@ from r2flow.data.sources import spread
 from r2flow.generators import Sampler
 from r2flow.lidar.projection import write_scan
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.model.inversion import interpolate_scans, round_trip
+from r2flow.model.inversion import interpolate_scans, metres_apart
 from r2flow.model.sampling import warn_unsolved
 from r2flow.reports.pages import Page
 from r2flow.reports.pictures import contact_sheet
@@ -50,8 +50,9 @@ def interpolation(
             "converged": bool(result.converged[number]),
         }
         rows.append(row)
-    errors = round_trip(checkpoint, result.ends)
-    off = ", ".join(f"{error:.2g} m" for error in errors["median_m"].tolist())
+    decode = checkpoint.encoding.decode
+    errors, _, _ = metres_apart(decode(result.ends.x_1), decode(result.ends.again))
+    off = ", ".join(f"{error:.2g} m" for error in errors.tolist())
     text: list[Part] = [
         f"The flow of {checkpoint.path.name}, step {checkpoint.step}, inverted both scans to noise "
         "and generated the frames from spherical interpolations (slerp) of it. The first and last "
