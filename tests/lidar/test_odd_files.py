@@ -90,7 +90,20 @@ def ply(kind: str, name: str, count: int, row: str) -> str:
 
 
 @pytest.mark.parametrize(
-    "name", ["rgb", "red", "nx", "normal_x", "timestamp", "time", "t", "gps_time", "label"]
+    "name",
+    [
+        "rgb",
+        "red",
+        "nx",
+        "normal_x",
+        "timestamp",
+        "time",
+        "t",
+        "gps_time",
+        "label",
+        "valid",
+        "is_ground",
+    ],
 )
 def test_what_is_no_reflectance_is_not_proposed_as_one(tmp_path, caplog, name):
     _warned.clear()

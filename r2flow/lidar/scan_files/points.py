@@ -34,11 +34,12 @@ _ROLES: Mapping[str, tuple[str, ...]] = {
     "measured": ("measured",),  # r2flow's: 0 for a point that a completion added
 }  # fmt: skip
 _ONCE = ("x", "y", "z", "reflectance", "ring")  # a file's columns name each at most once
-# What no reflectance is called: colours, normals, times, labels, angles and distances.
+# What no reflectance is called: colours, normals, times, labels, angles, distances and flags.
 _OTHERS = re.compile(
     "rgba?|[rgbat]|red|green|blue|alpha|colou?rs?.*|n[xyz]|normals?.*|curvature|.*(time|stamp).*"
     "|ts|dt|t_.*|.*(label|class|instance|segment|index).*|id|range|distance|depth|azimuth|elevation"
     "|(row|col).*|returns?.*|.*return_?(number|type).*|confidence|v[xyz]|velocity.*"
+    "|valid|mask|flags?|status|is_.*"
 )
 _ROLE_OF = {alias: role for role, aliases in _ROLES.items() for alias in aliases}
 
