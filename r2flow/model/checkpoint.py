@@ -94,7 +94,7 @@ class Checkpoint:
         without a return.
 
         Args:
-            how: Options of `r2flow.model.sampling.sample`: sampler, steps, batch_size, region, ...
+            how: Options of `r2flow.model.sampling.sample`: sampler, steps, batch_size, ...
         """
         return torch.cat([drawn.images for drawn in sample(self, num, seed, **how)])
 

@@ -29,7 +29,7 @@ class HasGenerator(Protocol):
 class Samples:
     """Generated scans; tensors are on the CPU."""
 
-    #: range in metres and reflectance, (B, 2 or 1, H, W); 0 for rays dropped or not requested
+    #: range in metres and reflectance, (B, 2 or 1, H, W); 0 for rays dropped
     images: Tensor
     first: int  #: number of the first scan
     evaluations: Tensor  #: network evaluations per scan, (B,)
