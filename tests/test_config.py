@@ -205,6 +205,10 @@ def test_the_groups_of_conf_are_groups_of_the_default_config(config):
     )
 
 
+def test_a_folder_of_a_sweep_is_quoted_once():
+    assert as_override("stage.parent", "sweep/seed=1") == "\"stage.parent='sweep/seed=1'\""
+
+
 @pytest.mark.parametrize(
     "path",
     [

@@ -148,4 +148,6 @@ def override(key: str, value: Any) -> str:
 
 def as_override(key: str, path: str | Path) -> str:
     """KEY=PATH quoted for a shell and for Hydra's grammar."""
-    return shlex.quote(override(key, str(path)))
+    text = override(key, str(path))
+    plain = "'" in text and not re.search(r'["$`\\!]', text)  # within double quotes
+    return f'"{text}"' if plain else shlex.quote(text)
