@@ -182,6 +182,8 @@ def complete(
     from r2flow.model.shipped import DEFAULT, DENSIFY
     from r2flow.reports.answer_rays import Job, lack_sectors
     from r2flow.reports.answers import write_completed
+    from r2flow.reports.outputs import recipe_of
+    from r2flow.reports.recordings import complete_recording
 
     if any(map(is_recording, what)):
         alone = len(what) == 1 and num == 1 and not (part.mask or part.hide or part.scans)
@@ -192,7 +194,19 @@ def complete(
             print_model(DENSIFY)
         precision = precision or usual_precision(model.generator)
         settings = {**part.settings, "precision": precision, "max_error": max_error}
-        _complete_recording(Path(what[0]), out, part, how, model, settings, seed)
+        check_folder(out.parent)
+        sampler = completing(model.generator, **how.fields)
+        recipe = recipe_of(model, seed, sampler, completion={**settings})
+        completer = model.completer(settings.pop("from"), sampler=sampler, **settings)
+
+        complete_recording(
+            Path(what[0]),
+            out,
+            part.topic,
+            part.other_topics,
+            lambda cloud, number: completer.completed(cloud, number, seed, what[0]),
+            recipe,
+        )
         return
     check_folder(out)
     job = Job(
@@ -230,30 +244,3 @@ def complete(
         print(*remarks, sep="\n")
     about = {"mask": part.mask and mask_identity(part.mask), **part.settings}
     print(*write_completed(model, scans, out, job, sampler, about), sep="\n")
-
-
-def _complete_recording(
-    path: Path,
-    out: Path,
-    part: _PartialOptions,
-    how: SamplerOptions,
-    model: "Checkpoint",
-    settings: dict[str, Any],
-    seed: int,
-) -> None:
-    from r2flow.model.completion import completing
-    from r2flow.reports.outputs import recipe_of
-    from r2flow.reports.recordings import complete_recording
-
-    check_folder(out.parent)
-    sampler = completing(model.generator, **how.fields)
-    recipe = recipe_of(model, seed, sampler, completion={**settings})
-    completer = model.completer(settings.pop("from"), sampler=sampler, **settings)
-    complete_recording(
-        path,
-        out,
-        part.topic,
-        part.other_topics,
-        lambda cloud, number: completer.completed(cloud, number, seed, str(path)),
-        recipe,
-    )
