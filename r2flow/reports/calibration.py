@@ -82,7 +82,8 @@ def trust_of(model: Checkpoint, truths: Sequence[ndarray], progress: Progress = 
     first, second = (
         float(np.partition(one, rank)[rank]) for one, rank in zip(scores, ranks, strict=True)
     )
-    within = ((model.sensor.error_factors or 1) >= scores.T).mean(0).tolist()
+    had = np.array(model.sensor.error_factors or (1.0, 1.0))[:, None]
+    within = (scores / had <= 1).mean(1).tolist()
     return Trust((first, second), (within[0], within[1]), count)
 
 
