@@ -4,7 +4,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 from r2flow.base.errors import InputError, naming, warn_odd
@@ -18,6 +18,7 @@ from r2flow.data.sensor_checks import a_few
 from r2flow.data.sources import spread
 from r2flow.lidar.other_sensors import Partial, image_through
 from r2flow.lidar.scan_files import Points, points_beside, points_of, read_cloud, scan_ending
+from r2flow.lidar.scan_files.tables import KEPT
 from r2flow.lidar.sensors import Sensor
 
 _FEW = 4  # default number of simulated scans
@@ -135,7 +136,10 @@ def _measured_points(path: Path, columns: Sequence[str] | None) -> Points:
     measured = cloud.measured()
     if len(measured) < len(cloud):
         warn_odd(path, "points that a completion added are left out", len(cloud) - len(measured))
-    return points_of(path, measured)
+    return _points(path, measured)
+
+
+_points = lru_cache(KEPT)(points_of)  # of a cloud that is seen again in its own view
 
 
 def _images(

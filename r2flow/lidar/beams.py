@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import groupby
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.ndimage import fourier_gaussian, median
 
 from r2flow.base.errors import InputError
 from r2flow.lidar.scan_files import Points
+from r2flow.lidar.scan_files.tables import KEPT
 from r2flow.lidar.unfolding import (
     FEWEST,
     MOST,
@@ -62,8 +64,11 @@ class Beams:
         return abs(elevation - self.elevations[row])[row >= 0]
 
 
+@lru_cache(KEPT)
 def find_beams(*scans: Points) -> Beams:
     """Find beams by ring numbers, else by the order of the points, else by their elevations only.
+
+    Beams of the scans last asked for are kept: several judgements of a scan need them.
 
     Raises:
         NoBeamsError: The points lie on no beams.

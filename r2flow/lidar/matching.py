@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import lru_cache
 from itertools import product
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from r2flow.base.errors import InputError
 from r2flow.lidar.beams import NoBeamsError, find_beams
 from r2flow.lidar.scan_files import Points
+from r2flow.lidar.scan_files.tables import KEPT
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.unfolding import elevations_of
 
@@ -99,7 +101,8 @@ def other_sensor(scans: Sequence[Points], sensor: Sensor) -> Doubt | None:
     return Doubt(f"{void} of its {rows} rows lie between their beams and stay empty", None)
 
 
-def is_tilted(scans: Sequence[Points]) -> bool:
+@lru_cache(KEPT)
+def is_tilted(*scans: Points) -> bool:
     """Whether beams become clearer if the points are pitched and rolled.
 
     Then they are not in the sensor's own frame. Beams are clear if few elevations have many points:
@@ -125,7 +128,7 @@ def is_unclear(scans: Sequence[Points]) -> bool:
     with suppress(InputError):
         if np.median(find_beams(*scans).off(scans)) > _MOST_OFF:
             return True
-    return is_tilted(scans)
+    return is_tilted(*scans)
 
 
 def differing(scans: Sequence[Points]) -> list[tuple[int, ndarray]]:

@@ -1,6 +1,7 @@
 """Sensors told by their scans: every sensor with its own scans and with every other one's."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -345,7 +346,7 @@ def test_real_scans_are_of_their_own_sensor_alone(shared: Path, pattern: str):
     for one in scans:
         for name in HDL64E if true in HDL64E else {true} - {"os1_64"}:
             assert other_sensor([one], SENSORS[name]) is None
-        assert not is_tilted([one])
+        assert not is_tilted(one)
 
 
 def pitched(points: Points, degrees: float) -> Points:
@@ -376,7 +377,7 @@ def test_two_sensors_in_one_file_are_warned_of(tmp_path: Path, caplog, ringed: b
 def test_points_in_the_frame_of_a_pitched_vehicle_are_found(name: str):
     level = scan(SENSORS[name].resized(columns=384), UNORDERED)
     for degrees, tilted in ((0, False), (0.5, False), (2, True), (-5, True)):
-        assert is_tilted([pitched(level, degrees)]) == tilted, degrees
+        assert is_tilted(pitched(level, degrees)) == tilted, degrees
     other = scan(SENSORS["os1_64" if name == "vlp16" else "vlp16"].resized(columns=384), UNORDERED)
     pairs = [{name: level, "2": second} for second in (level, other)]
     assert [warn_of_frame(pair, named=True) for pair in pairs] == [False, True]
@@ -399,14 +400,14 @@ def test_scans_of_two_sensors_differ_and_a_thinned_scan_does_not(name: str):
 
 def test_real_scans_are_tilted_only_in_another_frame(shared: Path):
     for points in real(shared, "other_sensors/vlp16/*.pcd"):
-        assert is_tilted([pitched(points, 5)])
+        assert is_tilted(pitched(points, 5))
     for points in real(shared, "*/**/*.bin", step=6):
         quarter = points.xyz[find_beams(points).of_point[0] % 4 == 0]
         noisy = quarter + np.random.default_rng(0).normal(0, 0.02, quarter.shape).astype(np.float32)
         assert not any(
-            is_tilted([one]) for one in (points, *map(Points, (quarter, noisy, noisy * 1e-30)))
+            is_tilted(one) for one in (points, *map(Points, (quarter, noisy, noisy * 1e-30)))
         )
-        assert is_tilted([pitched(Points(quarter), 5)])
+        assert is_tilted(pitched(Points(quarter), 5))
 
 
 def test_a_part_of_the_view_is_enough(shared: Path):
@@ -533,3 +534,9 @@ def test_the_beams_of_shuffled_scans_are_there(shared: Path):
             order = np.random.default_rng(0).permutation(len(points.xyz))
             found = other_sensor([Points(points.xyz[order])], SENSORS["hdl64e"])
             assert found is None or not found.hopeless
+
+
+def test_beams_of_the_same_scans_are_found_once():
+    points = scan(SENSORS["vlp16"].resized(columns=384), UNORDERED)
+    assert find_beams(points) is find_beams(points)
+    assert find_beams(points) is not find_beams(replace(points))
