@@ -80,7 +80,7 @@ class EMA(WeightAveraging):
     def on_train_start(self, trainer, pl_module):
         self._end = trainer.estimated_stepping_batches - 1
         if self.warmup_steps is None:
-            images = pl_module.hparams.get("warmup_images", 0)
+            images = getattr(pl_module, "warmup_images", 0)
             self.warmup_steps = images and images // pl_module.images_per_step
 
 

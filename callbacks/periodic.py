@@ -56,7 +56,7 @@ class Periodic(L.Callback, ABC):
 
 def seed_of(module: L.LightningModule) -> int:
     """The seed of a stage; 0 of other modules."""
-    return int(module.hparams.get("seed", 0))
+    return int(getattr(module, "seed", 0))
 
 
 class SamplePictures(Periodic):

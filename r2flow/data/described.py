@@ -136,14 +136,17 @@ class Described:
 Spec = str | Path | Described
 
 
-def describe(spec: Spec, **options: Any) -> Described:
+def describe(
+    spec: Spec, split: str | None = None, drives: list[str | int] | None = None
+) -> Described:
     """Look a name of scans up.
 
     Args:
         spec: A scan file, a range image (.npy) or a folder of them, a folder of `r2flow prepare`,
             `NAME:ROOT` with a name of `SOURCES`, `simulated:SEED`, a folder of samples, or a run
             folder (its samples).
-        options: Of `SourceOptions`: split, drives, scenes.
+        split: Part of the data set's standard split; None: all.
+        drives: Names or numbers of the drives to take; None: all.
 
     Raises:
         InputError: there is no such file, folder or data set.
@@ -154,17 +157,17 @@ def describe(spec: Spec, **options: Any) -> Described:
     path = Path(text).expanduser()
     kind, colon, root = text.partition(":")
     simulated = bool(colon) and kind == SIMULATED
-    if options.get("split") and (simulated or path.is_file()):
-        raise InputError(f"{text} has no split: leave {options['split']!r} out.")
+    if split and (simulated or path.is_file()):
+        raise InputError(f"{text} has no split: leave {split!r} out.")
     if simulated:
         if not root.isdecimal():
             raise InputError(
                 f"simulated scans are named by their seed, as simulated:0; found {text!r}."
             )
-        scenes = {"scenes": _SCENES, **options}
-        return Described(text, SourceOptions(kind, **scenes), seed=int(root))
+        options = SourceOptions(kind, drives=drives, scenes=_SCENES)
+        return Described(text, options, seed=int(root))
     if colon and kind in SOURCES:
-        return Described(text, SourceOptions(kind, root, **options))
+        return Described(text, SourceOptions(kind, root, split, drives))
     if path.is_file():
         return Described(text, SourceOptions(FOLDER, str(path.parent)), path)
     if not path.exists():
@@ -176,7 +179,7 @@ def describe(spec: Spec, **options: Any) -> Described:
             raise InputError(
                 f"{run} is a run without samples; draw some: r2flow sample {run} --out {path}."
             )
-    scans = Described(text, SourceOptions(FOLDER, str(path), **options))
+    scans = Described(text, SourceOptions(FOLDER, str(path), split, drives))
     if scans.manifest.get("format") == "r2flow scans":
         scans.options = replace(scans.options, name=PREPARED)
     return scans

@@ -126,11 +126,12 @@ def _parts(run: DataOptions) -> list[PartOptions]:
 
 
 def _held_out(run: DataOptions, other: Options, sensor: Sensor) -> Described:
-    options = {"name": run.name, "root": run.root, "split": None, "scenes": run.scenes, **other}
     inherited = run.reading_fields
-    if options["name"] != run.name:
+    root = run.root
+    if other.get("name", run.name) != run.name:
         inherited = _of_other_files(inherited)
-        options["root"] = other.get("root")
+        root = None
+    options = {"name": run.name, "root": root, "split": None, "scenes": run.scenes, **other}
     held = _checked_set("data.validation.data", SourceOptions, options)
     return _complete(held, sensor, inherited)
 
@@ -138,8 +139,9 @@ def _held_out(run: DataOptions, other: Options, sensor: Sensor) -> Described:
 def _checked_set(what: str, kind: type[Source], options: Options) -> Source:
     """One set of scans. Refuses a data set with a standard split of which no part is named."""
     source = construct(what, kind, options)
-    if options.get("name") in (None, MIXED, PAIRS):
-        raise InputError(f"{what} needs the name of a data set, found {options.get('name')!r}.")
+    name = options.get("name")
+    if name in (None, MIXED, PAIRS):
+        raise InputError(f"{what} needs the name of a data set, found {name!r}.")
     splits = ", ".join(SOURCES[source.name].splits)
     if splits and "split" not in options:
         raise InputError(

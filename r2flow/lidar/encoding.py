@@ -242,6 +242,7 @@ def encoding_options(encoding: Encoding | str | Mapping[str, Any]) -> dict[str, 
 
 def build_space(config: Mapping[str, Any]) -> ModelSpace:
     """The model space of a config with the keys `sensor` and `encoding`."""
-    sensor = construct("sensor", build_sensor, config["sensor"])
+    options = config["sensor"]
+    sensor = construct("sensor", build_sensor, options)
     encoding = construct("encoding", Encoding, config["encoding"], sensor)
-    return ModelSpace(sensor, encoding, sensor.rays(config["sensor"].get("rays", "centre")))
+    return ModelSpace(sensor, encoding, sensor.rays(options.get("rays", "centre")))

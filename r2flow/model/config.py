@@ -128,6 +128,39 @@ class _CallbackKeys:
     progress: Free[Any]
 
 
+@dataclass(frozen=True)
+class StageRecord:
+    """How a model is trained."""
+
+    name: str = ""  # of a stage in `STAGES`; empty: unknown
+    parent: ParentRecord | None = None  # the model that it starts from; before a run its path alone
+    options: Options = field(default_factory=dict)  # the stage's others
+
+    @classmethod
+    def of(cls, group: Options) -> "StageRecord":
+        """The record of a config's group `stage`."""
+        options = dict(group)
+        name = options.pop("name", None)
+        parent = options.pop("parent", None)
+        if parent is not None:
+            known = parent if isinstance(parent, Mapping) else {"path": str(parent)}
+            parent = construct("stage.parent", ParentRecord, known)
+        return cls(name or "", parent, options)
+
+    @property
+    def steps(self) -> int | None:
+        """Sampling steps of a distilled model, else None."""
+        return self.options.get("steps")
+
+
+@dataclass(frozen=True)
+class Length:
+    """How long a run is to train."""
+
+    max_steps: int = 0  # 0: unknown
+    max_epochs: int | None = None
+
+
 @strict
 @dataclass(frozen=True)
 class RunConfig:
@@ -173,6 +206,11 @@ class RunConfig:
         }
         return construct("the config", cls, {**config, **typed})
 
+    @cached_property
+    def recipe(self) -> StageRecord:
+        """The stage, with its options."""
+        return StageRecord.of(self.stage)
+
     def plain(self) -> Config:
         """The config as nested dictionaries, as in its file."""
         return asdict(self)
@@ -180,15 +218,6 @@ class RunConfig:
     def model_config(self) -> "ModelConfig":
         """The config that a checkpoint of the run has."""
         return ModelConfig(self.plain())
-
-
-@dataclass(frozen=True)
-class StageRecord:
-    """How a model was trained."""
-
-    name: str | None = None  # of a stage in `STAGES`; None: unknown
-    parent: ParentRecord | None = None  # the model that it started from
-    options: Options = field(default_factory=dict)  # the stage's others
 
 
 @dataclass(frozen=True)
@@ -208,6 +237,11 @@ class ModelConfig:
         return (self.stored.get("backbone") or {}).get("name")
 
     @property
+    def encoding(self) -> Config:
+        """Options of the encoding."""
+        return self.stored.get("encoding") or {}
+
+    @property
     def generator(self) -> Config:
         """Name and options of the generator."""
         return self.stored.get("generator") or {"name": "rectified_flow"}
@@ -215,12 +249,7 @@ class ModelConfig:
     @cached_property
     def stage(self) -> StageRecord:
         """The stage that trained it."""
-        options = dict(self.stored.get("stage") or {})
-        name = options.pop("name", None)
-        parent = options.pop("parent", None)
-        if isinstance(parent, Mapping):
-            parent = construct("stage.parent", ParentRecord, parent)
-        return StageRecord(name, parent, options)
+        return StageRecord.of(self.stored.get("stage") or {})
 
     @cached_property
     def data(self) -> DataOptions:
@@ -239,7 +268,12 @@ class ModelConfig:
     @property
     def steps(self) -> int:
         """Optimiser steps of the whole training; 0: unknown."""
-        return (self.stored.get("trainer") or {}).get("max_steps") or 0
+        return self.length.max_steps
+
+    @cached_property
+    def length(self) -> Length:
+        """How long it was to be trained."""
+        return Length(**_known(Length, self.stored.get("trainer") or {}))
 
     @property
     def plugins(self) -> Sequence[str]:

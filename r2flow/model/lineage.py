@@ -109,7 +109,8 @@ def model_options(
             "have; "
             "start from a flow trained on spherical images."
         )
-    generator = _generator(given.get("generator"), theirs.get("generator"), generator_name)
+    of_parent = parent.config.generator if parent else None
+    generator = _generator(given.get("generator"), of_parent, generator_name)
     options: Config = {}
     for group, (default, complete) in _GROUPS.items():
         own = given.get(group)
@@ -118,16 +119,14 @@ def model_options(
         else:
             options[group] = _changed(theirs[group], own, complete)
     encoding = options["encoding"]
+    if encoding["reflectance"] == AUTO:
+        encoding["reflectance"] = parent is None or parent.config.encoding["reflectance"]
     if parent is not None:
-        if encoding["reflectance"] == AUTO:
-            encoding["reflectance"] = theirs["encoding"]["reflectance"]
         # But for options that weights do not depend on.
         _refuse_other("backbone", options, parent, {"attention", "dropout"})
         _refuse_other("encoding", options, parent, {"levels"})
         if on_pairs:
             _refuse_other("sensor", options, parent, {"reflectance_scale"})
-    if encoding["reflectance"] == AUTO:
-        encoding["reflectance"] = True
     return {**options, "generator": generator}
 
 

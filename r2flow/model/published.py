@@ -4,7 +4,7 @@ An R2Flow file is a dict of cfg, weights, optimizer, lr_scheduler and num_images
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,8 +12,27 @@ import torch
 from torch import Tensor
 
 from r2flow.base.registry import Config, Options, Registry, lazy
+from r2flow.model.config import ModelConfig
 
 BACKBONE = "backbone."  # prefix of a flow's network in the generator
+
+
+@dataclass(frozen=True)
+class Scans:
+    """The group `data` of a published config."""
+
+    dataset: str
+    projection: str
+    resolution: Sequence[int]
+    data_format: str
+    train_reflectance: bool
+    min_depth: float
+    max_depth: float
+
+    @classmethod
+    def of(cls, group: Options) -> "Scans":
+        """The keys of a published config that r2flow has, too."""
+        return cls(**{one.name: group[one.name] for one in fields(cls)})
 
 
 @dataclass(frozen=True)
@@ -52,11 +71,12 @@ def read(content: Any, path: Path, averaged: bool = True) -> Published:
     Euler steps.
     """
     cfg = content["cfg"]
-    weights = {BACKBONE + name: value for name, value in content["weights"].items()}
-    batch_size = int(cfg.get("training", {}).get("batch_size", 1))
-    step = int(content.get("num_images", 0)) // max(batch_size, 1)
     config = published_config(cfg)
-    k = config["stage"].get("steps")  # None: not distilled
+    k = ModelConfig(config).stage.steps  # None: not distilled
+    weights = {BACKBONE + name: value for name, value in content["weights"].items()}
+    training = cfg.get("training", {})
+    batch_size = int(training.get("batch_size", 1))
+    step = int(content.get("num_images", 0)) // max(batch_size, 1)
     sampler = {"name": "euler", "steps": k}
     return Published(config, weights, step, sampler, rings_of(config, weights), k is not None)
 
@@ -72,7 +92,7 @@ def published_config(cfg: Options) -> Config:
     """Convert a published checkpoint's `cfg` (data, model, flow, training, finetuning) to an r2flow
     config.
     """
-    data = cfg["data"]
+    scans = Scans.of(cfg["data"])
     tuning = cfg.get("finetuning")
     stage = {}  # of an older file, which does not say it
     if tuning:
@@ -81,13 +101,13 @@ def published_config(cfg: Options) -> Config:
             stage = {"name": "distill", "steps": k}
     return {
         "stage": stage,
-        "sensor": {**sensor_of("hdl64e", data["resolution"], data), "rays": "reference"},
-        "encoding": {"format": data["data_format"], "reflectance": bool(data["train_reflectance"])},
+        "sensor": {**sensor_of("hdl64e", scans.resolution, vars(scans)), "rays": "reference"},
+        "encoding": {"format": scans.data_format, "reflectance": bool(scans.train_reflectance)},
         "backbone": _backbone_of(cfg["model"]),
         "data": {
-            "name": data["dataset"],
+            "name": scans.dataset,
             "reading": {
-                "projection": str(data["projection"]).split("-")[0],
+                "projection": str(scans.projection).split("-")[0],
                 "convention": "reference",
             },
         },
@@ -122,7 +142,8 @@ def _backbone_of(model: Options) -> Config:
 
 def rings_of(config: Options, weights: Mapping[str, Tensor]) -> Tensor | None:
     """The elevations of the rows of unfolded scans, from the weights' `coords`, (1, 2, H, W)."""
-    unfolded = config["data"]["reading"]["projection"] == "unfolding"
+    reading = ModelConfig(config).data.reading
+    unfolded = reading is not None and reading.projection == "unfolding"
     return weights[BACKBONE + "coords"][0, 0, :, 0] if unfolded else None
 
 

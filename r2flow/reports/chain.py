@@ -61,7 +61,7 @@ def report_chain(runs: Mapping[str, Path], out: Path, device: str = "cpu") -> No
     drawn = list(_drawn(makers, device))
     rows = [row for row, _ in drawn]
     captions = [row["title"] for row in rows]
-    labels = [link_label(one, model.config.stage.name or "") for one, model in makers.items()]
+    labels = [link_label(one, model.config.stage.name) for one, model in makers.items()]
     if rows[-1]["scans"] == DEFAULT:
         labels.append(f"{DEFAULT} (a larger model, included)")
     about = f"{', '.join(labels)}. An evaluation runs the network once."

@@ -59,10 +59,10 @@ def role_of(checkpoint: Checkpoint, label: str) -> str:
         if (generator.get("unet") or {}).get("position") == "learnable":
             system = f"{system} + APE"
         return system if checkpoint.encoding.reflectance else f"{system}, range"
-    role, learned_from = _ROLES.get(stage.name or "", (label, None))
+    role, learned_from = _ROLES.get(stage.name, (label, None))
     if stage.parent and stage.parent.stage not in (None, learned_from):
         return label
-    return role.format(stage.options.get("steps"))
+    return role.format(stage.steps)
 
 
 def report_paper(models: Sequence[str], results: Sequence[Path]) -> Page:

@@ -78,7 +78,7 @@ def _read_values(path: Path, config: ModelConfig, curves: Mapping[str, Curve]) -
     data = config.data
     scans = "" if data.name == PAIRS else data.root or ""
     return {
-        "stage": f"{stage.name} {stage.options.get('steps', '')}".strip(),
+        "stage": f"{stage.name} {stage.steps or ''}".strip(),
         "loss": str([stage.options.get(key) for key in ("loss", "time")]),
         "data": f"{data.name} {scans}".strip(),
         "backbone": config.backbone,

@@ -2,7 +2,7 @@
 
 import logging
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -79,11 +79,10 @@ def build(
     before = ModelConfig(read_config(run.run_dir) or {})
     with quiet(), made_with(before.plugins, f"the run in {run.run_dir}"):
         keys = [key_of(text) for text in asked]
-        stage_options = dict(run.stage)
-        stage_class = STAGES[stage_options.pop("name")]
-        named = stage_options.pop("parent", None)
-        if parent is None and named is not None:
-            parent = find_parent(named["path"] if isinstance(named, Mapping) else named)
+        recipe = run.recipe
+        stage_class = STAGES[recipe.name]
+        if parent is None and recipe.parent:
+            parent = find_parent(recipe.parent.path)
         with made_with(parent.config.plugins if parent else (), "the run that it starts from"):
             options = model_options(
                 _given(run, keys, parent),
@@ -95,17 +94,16 @@ def build(
         options["encoding"] = data.encoding.described()
         options |= {"parent": parent, "sampler": run.sampler, "few": run.few, "seed": run.seed}
         stage: Stage = construct(
-            f"stage '{run.stage['name']}'", stage_class, {**stage_options, **options}
+            f"stage '{recipe.name}'", stage_class, {**recipe.options, **options}
         )
-        if stage.hparams["backbone"] is None and any(key.startswith("backbone") for key in keys):
-            raise InputError(
-                f"stage={run.stage['name']} has its own network: leave the backbone out."
-            )
+        networked = hasattr(stage.generator, "backbone")
+        if not networked and any(key.startswith("backbone") for key in keys):
+            raise InputError(f"stage={recipe.name} has its own network: leave the backbone out.")
         stage.check_data(data)
         data.adopt(stage.item_format)
         trainer = _build_trainer(run, stage)
         data.share(trainer)  # refuses a batch that cannot be shared before there is a folder
-        complete = config_of(stage.hparams, data.hparams, run.stage["name"])
+        complete = config_of(stage.hparams, data.hparams, recipe.name)
         complete["data"] = construct("data", DataOptions, complete["data"])
         plugins = list(run.plugins) or loaded_plugins()
         return Run(replace(run, **complete, plugins=plugins), stage, data, trainer)
@@ -156,6 +154,7 @@ def _build_data(
         usual = {"projection": theirs.projection, "convention": theirs.convention}
         data = replace(data, reading=ReadingOptions(**{**usual, **data.reading_fields}))
     encoding = dict(options["encoding"])
+    levels = encoding.get("levels")
     if parent is None:
         encoding["reflectance"] = run.encoding.get("reflectance", True)  # `auto` looks at the scans
     if "encoding.levels" not in keys:
@@ -164,7 +163,7 @@ def _build_data(
         **vars(data), sensor=options["sensor"], encoding=encoding, seed=run.seed
     )
     if module.encoding.levels is None:
-        module.encoding.levels = options["encoding"].get("levels")
+        module.encoding.levels = levels
     if parent and drawer and module.pairs:
         for group in ("sensor", "encoding"):
             if drawer.config.model[group] != parent.config.model[group]:
@@ -196,10 +195,9 @@ def _build_trainer(run: RunConfig, stage: Stage) -> L.Trainer:
         raise InputError("trainer.precision=16-mixed needs a GPU: give bf16-mixed or 32-true.")
     if not stage.automatic_optimization:  # Lightning leaves these two to the stage
         if options.accumulate_grad_batches != 1:
-            name = run.stage["name"]
             raise InputError(
-                f"stage={name} takes its own optimiser steps: trainer.accumulate_grad_batches must "
-                "be 1."
+                f"stage={run.recipe.name} takes its own optimiser steps: "
+                "trainer.accumulate_grad_batches must be 1."
             )
         stage.gradient_clip_val = options.gradient_clip_val
         options = replace(options, gradient_clip_val=None)

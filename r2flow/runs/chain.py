@@ -49,14 +49,15 @@ def links_of(
         parent = settings.pop("parent", None)
         earlier = [link.name for link in links]
         # A mistyped link has neither.
-        begins = "experiment" in settings or "parent" in settings.get("stage", ())
+        stage = settings["stage"]
+        begins = "experiment" in settings or "parent" in stage
         if parent not in (None, *earlier) or (links and not begins and parent is None):
             raise InputError(
                 f"chain.{name} starts from {parent or 'nothing'}; give parent=EARLIER or an "
                 "experiment."
             )
         if parent is not None:
-            settings["stage"]["parent"] = str(Path(folder, parent))
+            stage["parent"] = str(Path(folder, parent))
         # Overrides given for this link alone come last: they replace the link's own keys.
         prefix = re.compile(rf"\+*chain\.{re.escape(name)}\.(?!parent=)")
         alone = [prefix.sub("", text, count=1) for text in given if prefix.match(text)]
@@ -92,14 +93,14 @@ def _link(
     """A link with the overrides of the chain's command line that concern it."""
     with naming(f"chain.{name}"):
         config = RunConfig.of(compose(last, configs, settings))
-        on_pairs = config.data.name == PAIRS or STAGES[config.stage["name"]].needs_pairs
+        on_pairs = config.data.name == PAIRS or STAGES[config.recipe.name].needs_pairs
     concerning = ("all", "pairs" if on_pairs else "scans")
     overrides = [*(text for text in given if links_of_key(text) in concerning), *last]
     try:
         config = RunConfig.of(compose(overrides, configs, settings))
-        if config.data.name != SIMULATED and "scenes" in settings.get("data", ()):
-            # Other scans have no scenes, or their own.
-            del settings["data"]["scenes"]
+        data = settings.get("data", {})
+        if config.data.name != SIMULATED and "scenes" in data:
+            del data["scenes"]  # other scans have none, or their own
             config = RunConfig.of(compose(overrides, configs, settings))
     except InputError as error:
         raise _in_link(name, error) from None
@@ -118,7 +119,7 @@ def train_links(links: Sequence[Link]) -> int:
     for number, link in enumerate(links, 1):
         try:
             with naming(f"chain.{link.name}"):
-                label = link_label(link.name, link.config.stage["name"])
+                label = link_label(link.name, link.config.recipe.name)
                 print(f"[{number}/{len(links)}] {label}: {link.config.run_dir}", flush=True)
                 finished = fit(build(link.config, link.asked)).finished
         except Stopped:

@@ -15,7 +15,7 @@ from r2flow.base.config import at_most_three, check_tree, differences
 from r2flow.base.errors import InputError, check
 from r2flow.base.files import parse_yaml, write_file
 from r2flow.base.registry import Config, Options
-from r2flow.model.config import contradictions, is_found
+from r2flow.model.config import ModelConfig, contradictions, is_found
 from r2flow.model.parts import HYPER, NOTES
 from r2flow.model.paths import FOLDER, checkpoints_of, step_of
 from r2flow.model.tensor_files import read_checkpoint
@@ -77,9 +77,9 @@ def has_ended(run: str | Path, last: Path | None = None) -> bool:
     last = last or next(iter(checkpoints_of(run)), None)
     if config is None or last is None:
         return False
-    options = config.get("trainer") or {}
-    total = options.get("max_steps", 0)
-    if options.get("max_epochs") != -1:
+    length = ModelConfig(config).length
+    total = length.max_steps
+    if length.max_epochs != -1:
         total = read_checkpoint(last)[NOTES]["total_steps"]
     return 0 < total <= step_of(last)
 

@@ -144,8 +144,9 @@ def _run_hydra(
             given = list(HydraConfig.get().overrides.task)
             # The command line, not the overrides: a config file can make a sweeper add overrides.
             named_here = any(text.startswith("plugins=") for text in parsed.overrides)
-            if config["plugins"] and not named_here:
-                named = " ".join(f"--plugin {name}" for name in config["plugins"])
+            plugins = config["plugins"]
+            if plugins and not named_here:
+                named = " ".join(f"--plugin {name}" for name in plugins)
                 raise InputError(
                     f"plug-ins are named on the command line, never in a file: give {named}."
                 )
@@ -195,13 +196,15 @@ def _look_at_scans(config: DictConfig, given: Sequence[str]) -> None:
     """Refuse scans in files that no job of a sweep could train on, once; what else is wrong with a
     job, that says itself.
     """
-    if config["chain"] or config["data"]["name"] in ("simulated", "pairs"):
-        return
+    from r2flow.data.options import PAIRS, SIMULATED
     from r2flow.data.resolving import check_intensities
-    from r2flow.training import build
+    from r2flow.training import RunConfig, build
 
     try:
-        run = build(plain(config), given)
+        first = RunConfig.of(plain(config))
+        if first.chain or first.data.name in (SIMULATED, PAIRS):
+            return
+        run = build(first, given)
     except InputError:
         return
     if run.stage.encoding.reflectance:

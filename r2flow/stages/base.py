@@ -165,6 +165,12 @@ class Stage(L.LightningModule, NamedArguments):
             # `load_from_checkpoint` would give it those that it sets for its base, too.
             for name in self.hparams.keys() - inspect.signature(type(self)).parameters:
                 del self.hparams[name]
+        self.seed = seed
+        self.learning_rate = learning_rate
+        self.betas = betas[0], betas[1]
+        self.weight_decay = weight_decay
+        self.muon = muon
+        self.warmup_images = warmup_images
         self.own_network = isinstance(backbone, nn.Module)
         source = None
         if parent is not None and not isinstance(parent, Mapping):
@@ -217,11 +223,6 @@ class Stage(L.LightningModule, NamedArguments):
         """Set the sampler that this stage trains the generator for; it may be replaced by the
         options `sampler`.
         """
-
-    @property
-    def seed(self) -> int:
-        """Seed of draws in training."""
-        return self.hparams["seed"]
 
     @property
     def space(self) -> ModelSpace:
@@ -415,20 +416,14 @@ class Stage(L.LightningModule, NamedArguments):
         """AdamW or `Muon` with a schedule for each group of parameters, in the format of
         `configure_optimizers`.
         """
-        options = self.hparams
         kind: Any = torch.optim.AdamW
-        if options["muon"] is not None:
-            kind = partial(Muon, rate=options["muon"])
+        if self.muon is not None:
+            kind = partial(Muon, rate=self.muon)
         optimizers = [
-            kind(
-                group,
-                lr=options["learning_rate"],
-                betas=tuple(options["betas"]),
-                weight_decay=options["weight_decay"],
-            )
+            kind(group, lr=self.learning_rate, betas=self.betas, weight_decay=self.weight_decay)
             for group in groups
         ]
-        warmup = options["warmup_images"] // self.images_per_step
+        warmup = self.warmup_images // self.images_per_step
 
         def factor(step: int) -> float:
             # The number of steps is known when training has begun.

@@ -75,9 +75,9 @@ class LearnFlowMap(Reflow):
     def check_data(self, data: ScanDataModule) -> None:
         super().check_data(data)
         if data.plan.scans is not None and self.objective is not straight:
+            name = OBJECTIVES.name_of(self.objective)
             raise InputError(
-                f"objective={self.hparams['objective']} learns jumps from velocities of pairs, "
-                "which are not those of "
+                f"objective={name} learns jumps from velocities of pairs, which are not those of "
                 "scans: leave data.scans out, or give stage.objective=straight."
             )
 

@@ -31,13 +31,13 @@ def _read_r2dm(content: Any, path: Path, averaged: bool = True) -> Published:
 def _published_config(cfg: Options) -> Config:
     """Convert a published checkpoint's `cfg` (data, model, diffusion, training) to our config."""
     diffusion = cfg["diffusion"]
-    if diffusion["timestep_type"] != "continuous" or not cfg["data"]["train_depth"]:
+    # The limits are class attributes in the published code, not saved.
+    data = {"min_depth": 1.45, "max_depth": 80.0, **cfg["data"]}
+    if diffusion["timestep_type"] != "continuous" or not data["train_depth"]:
         raise InputError(
             "only diffusions of range in continuous time are read, which its config does not "
             "describe."
         )
-    # The limits are class attributes in the published code, not saved.
-    data = {"min_depth": 1.45, "max_depth": 80.0, **cfg["data"]}
     data["data_format"] = _RANGES[data["depth_format"]]
     config = flow_config({**cfg, "data": data})
     config["encoding"]["limits"] = "open"

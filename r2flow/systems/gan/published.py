@@ -50,7 +50,8 @@ def _read_gan(content: Any, path: Path, averaged: bool = True) -> Published:
         },
         "published": cfg,
     }
-    step = int(content["step"]) // max(int(cfg["training"]["batch_size"]), 1)
+    training = cfg["training"]
+    step = int(content["step"]) // max(int(training["batch_size"]), 1)
     return Published(config, weights, step, elevations=angle[0, 0].double().mean(1))
 
 

@@ -165,11 +165,9 @@ class LearnGan(Stage):
             self.augment = construct("stage.augment", AdaptiveAugment, augment)
 
     def configure_optimizers(self) -> Any:
-        learning_rate = self.hparams["learning_rate"]
-        betas = tuple(self.hparams["betas"])
-        lazy = _lazy_adam(learning_rate, betas, self.r1_every if self.r1 else 0)
+        lazy = _lazy_adam(self.learning_rate, self.betas, self.r1_every if self.r1 else 0)
         return [
-            torch.optim.Adam(self.generator.parameters(), learning_rate, betas),
+            torch.optim.Adam(self.generator.parameters(), self.learning_rate, self.betas),
             torch.optim.Adam(self.discriminator.parameters(), *lazy),
         ]
 
