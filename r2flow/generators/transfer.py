@@ -282,10 +282,11 @@ class TransferFlow(Flow):
         answers = self._answered(t, x[:, :, near], {**condition, **part})
         likely = (asked[:, :, near] & (answers.returns > 0)).flatten().nonzero()[:, 0]
         x_1 = self._empty(known[:, :1])
-        flat = x_1[:, :, near].movedim(1, 0).flatten(1).clone()
+        rows = x_1[:, :, near].movedim(1, 0)
+        flat = rows.flatten(1).clone()
         for rays in likely.split(RAYS):
             flat[:, rays] = self._chosen(answers.of(rays))[0, :, 0]
-        x_1[:, :, near] = flat.unflatten(1, (len(x_1), -1, x_1.shape[3])).movedim(1, 0)
+        x_1[:, :, near] = flat.view_as(rows).movedim(1, 0)
         self.density = answers.among(x_1.shape[2], near)
         return x_1
 
