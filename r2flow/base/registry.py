@@ -177,25 +177,25 @@ class Registry(Mapping[str, _T]):
         """Name and options of an entry, from a name, also of a file in conf/, or a mapping with a
         name and options.
         """
-        chosen = {"name": given} if isinstance(given, str) else given
-        if not isinstance(chosen, Mapping) or not isinstance(chosen.get("name"), str):
+        options = {"name": given} if isinstance(given, str) else given
+        name = options.get("name") if isinstance(options, Mapping) else None
+        if not isinstance(name, str):
             known = ", ".join(sorted(self))
             raise InputError(
                 f"a {self.kind} config needs a 'name', found {quoted(given)}; known: {known}."
             )
-        options = dict(chosen)
-        name = options["name"]
+        options = dict(options)
         if name in self._entries or name not in presets(self.kind):
             return options
         preset = presets(self.kind)[name]
         return {**preset, **options, "name": preset["name"]}
 
     def build(self, given: str | Options, *args: Any) -> Any:
-        """Call the entry of `options` with `args` and its options as keywords."""
-        chosen = self.options(given)
-        name = chosen.pop("name")
+        """Construct the entry of a name, or of a group with its name, by `args` and the options."""
+        options = self.options(given)
+        name = options.pop("name")
         constructor: Any = self[name]
-        return construct(f"{self.kind} '{name}'", constructor, chosen, *args)
+        return construct(f"{self.kind} '{name}'", constructor, options, *args)
 
 
 @cache

@@ -9,7 +9,7 @@ from typer import Argument, Option
 from r2flow.base.devices import choose_device
 from r2flow.base.files import check_folder
 from r2flow.cli.app import app
-from r2flow.cli.options import SETS, DeviceOption, OutOption, parse_counts, several
+from r2flow.cli.options import SETS, DeviceOption, OutOption, parse_counts
 
 _UNITS = {"": 1, "s": 1, "min": 60, "h": 3600}
 
@@ -72,60 +72,21 @@ def ablate(
     """
     from r2flow.base.files import write_file
     from r2flow.base.signals import LATER
-    from r2flow.data.detection import reading_for
-    from r2flow.data.opening import open_scans
-    from r2flow.data.sets import ScanSet
-    from r2flow.model.checkpoint import Checkpoint
-    from r2flow.reports.ablation import Judge, measure_run, read_rows, reference_rows, write_rows
-    from r2flow.reports.ablation_page import COLUMNS, ablation_page
+    from r2flow.reports.ablation_page import COLUMNS
     from r2flow.reports.pages import print_text, write_page
     from r2flow.reports.tables import latex
-    from r2flow.runs.ablation import Ablation, training_cost
+    from r2flow.runs.ablate import ablate as train_and_measure
+    from r2flow.runs.ablation import Ablation
 
     where = choose_device(device)
     check_folder(out)
+    csv = rows or out / "ablation.csv"
     ablation = Ablation(keys, seeds, budget, out)
-    held_out = real or ablation.simulated()
-    if not ablation.of_systems:
-        evaluations = evaluations or [1, 2, 4, 16]
-    ablation.check()
-    path = rows or out / "ablation.csv"
-    settings = f"{ablation.settings}; {num} scans of {held_out}"
-    stored = [row for row in read_rows(path) if row["settings"] == settings]
-    others = [row for row in read_rows(path) if row["settings"] != settings]
-    seconds = ablation.seconds
-    done = {(row["seed"], row["combination"]) for row in stored if row["budget"] == seconds}
-    missing = [run for run in ablation.runs if run not in done]
-    if missing:
-        first = ablation.first()
-        model = Checkpoint(first.stage.generator, first.config.model_config())
-        scans = open_scans(held_out, reading_for([held_out], model), num=num)
-        source: Any = first.data.training_source
-        training = ScanSet("training scans", source, scans.sensor)
-        judge = Judge(scans, training, where)
-        if not stored:
-            stored = [{"settings": settings, "budget": 0, **row} for row in reference_rows(judge)]
-    for number, (seed, name) in enumerate(missing, 1):
-        left = (len(missing) - number + 1) * seconds / 60
-        print(
-            f"[{number}/{len(missing)}] {name}, seed {seed}: {left:.0f} min of training left",
-            flush=True,
-        )
-        if not ablation.train(seed, name):
-            return LATER
-        run = {"combination": name, "seed": seed, "budget": seconds, "settings": settings}
-        spent = 0.0
-        for link in ablation.runs[seed, name]:
-            cost = training_cost(link.config.run_dir)
-            spent += cost["seconds of training"]
-            for row in measure_run(link.config.run_dir, judge, evaluations):
-                stored.append({**run, "model": link.name or name, **cost, **row})
-                stored[-1]["seconds of training"] = spent
-        write_rows([*others, *stored], path)
-    about = f"{several(seeds, 'seed')} of {seconds / 60:.3g} minutes each; {settings}."
-    page = ablation_page(stored, list(ablation.variants), seconds, about, where)
+    page = train_and_measure(ablation, csv, real, num, evaluations, where)
+    if page is None:
+        return LATER
     print_text(page.text)
-    written = [*write_page(page, out), path]
+    written = [*write_page(page, out), csv]
     if format == "tex":
         write_file(out / "ablation.tex", latex(page.rows, COLUMNS))
         written.append(out / "ablation.tex")

@@ -126,17 +126,8 @@ def sensor(
     Pass the file to other verbs (--sensor mine.yaml), or place it in conf/sensor/ for train.py
     (sensor=mine).
     """
-    import numpy as np
-
-    from r2flow.base.errors import warn_odd
-    from r2flow.base.progress import track
-    from r2flow.data.described import describe
-    from r2flow.data.reflectance import DARK, is_dark
-    from r2flow.data.sensor_checks import warn_of_frame
-    from r2flow.lidar.estimation import estimate_sensor, hangs
-    from r2flow.lidar.matching import nearest_sensor
-    from r2flow.lidar.scan_files import points_beside, read_points
-    from r2flow.lidar.sensors import ENDINGS, SENSORS, sensor_yaml, write_sensor
+    from r2flow.data.estimating import estimated_sensor
+    from r2flow.lidar.sensors import ENDINGS, SENSORS
     from r2flow.reports.tables import print_table
 
     name = "mine"
@@ -146,41 +137,10 @@ def sensor(
         name = re.sub(r"\W", "_", out.stem, flags=re.ASCII)
         if name in SENSORS or not name[0].isalpha():
             name = f"my_{name}"
-    files = [path for scan in scans for path in describe(scan).some(most)]
-    paths = [points_beside(Path(path)) for path in files]
-    points = [read_points(path, columns) for path in track(paths, "reading", "scans", least=16)]
-    warn_of_frame(dict(zip(paths, points, strict=True)))
-    mine, beams, steps, off, ground = estimate_sensor(points, name)
-    degrees = mine.elevations
-    nearest, distance = nearest_sensor(beams.elevations)
-    scale = mine.reflectance_scale
-    reflectance = "none: encoding.reflectance=false"
-    if scale:
-        stored = [one.reflectance for one in points if one.reflectance is not None]
-        values = np.concatenate(stored)
-        beyond = (values > 1.001 * scale).sum()
-        if is_dark(values[values > 0], scale):
-            warn_odd(paths[0], DARK)
-        reflectance = f"reflectance_scale={scale:g}; {beyond:,} points beyond are clipped"
-    rows = {
-        "beams": f"{len(degrees)}: {beams.order}",
-        "elevations": f"{degrees[0]:+.2f} to {degrees[-1]:+.2f} degrees; "
-        f"points lie {off[0]:.2f} from their beams, 95 % of them within {off[1]:.2f}",
-        "nearest sensor": f"{nearest}, its beams {distance:.2f} degrees off" if nearest else "none",
-        "resolution": f"{steps:,.0f} steps a turn; images of {mine.columns} columns",
-        "range seen": f"{mine.min_range:g} to {mine.max_range:g} m; "
-        "raise min_range if the vehicle is visible",
-        "height": "not known: the ground lies above the sensor"
-        if hangs(points)
-        else f"{mine.height:.2f} m above the ground{'' if ground else ', assumed'}",
-        "reflectance": reflectance,
-    }
-    print_table(list(rows.items()), ("", ""))
+    found = estimated_sensor(scans, name, columns, most)
+    print_table(list(found.findings.items()), ("", ""))
     if out is not None:
-        comment = f"Estimated from {len(points)} scan(s), stored {beams.order}."
-        if out.exists() and out.read_bytes() != sensor_yaml(mine, comment).encode():
-            raise InputError(f"{out} exists, with other content; give another --out.")
-        write_sensor(mine, out, comment)
+        found.write(out)
         print(out)
 
 

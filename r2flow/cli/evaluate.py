@@ -16,8 +16,6 @@ from r2flow.cli.sets import EvaluateOptions, judged_sets, open_set, possible_met
 if TYPE_CHECKING:
     from r2flow.data.sets import ScanSet
 
-_REAL = "the real scans"
-
 
 @app.command(
     rich_help_panel="Measure",
@@ -71,8 +69,8 @@ def _evaluate(
 ) -> None:
     from r2flow.base.processes import rank_and_world_size
     from r2flow.data.described import describe
-    from r2flow.evaluation.comparing import Comparer, pairs_of, with_equal_panels
-    from r2flow.evaluation.copies import find_nearest, with_copies
+    from r2flow.evaluation.comparing import Comparer
+    from r2flow.evaluation.evaluate import evaluate
     from r2flow.evaluation.measuring import Work
     from r2flow.evaluation.protocols import PROTOCOLS
     from r2flow.evaluation.sets import is_checkpoint
@@ -94,7 +92,6 @@ def _evaluate(
     if used and not any(used):
         reading = replace(reading, reflectance=False)  # else a scale would be required
     truth = open_set(truths, reading, options.real_num)
-    rules.check(truth)
     judged = judged_sets(named, flows, files, reading, options)
     sets = [truth, *judged.values()]
     reflectance = all(scans.about.get("reflectance") for scans in sets)
@@ -102,18 +99,13 @@ def _evaluate(
     work = Work(options.batch_size, options.workers)
     results = options.out and options.out / "results"
     compare = Comparer(metrics, work, rules, results)
-    compare.check(sets)
-    training = trained and open_set(trained, reading, None)
+    training = open_set(trained, reading, None) if trained else None
     for folder in filter(None, (options.out, options.json and options.json.parent)):
         check_folder(folder)
-    pairs = pairs_of(truth, judged, options.reference, options.baselines)
-    comparisons = with_equal_panels([compare(*pair) for pair in pairs])
-    if rank_and_world_size()[0] > 0:  # the first process prints and writes the results
-        return
-    if training:
-        nearest = find_nearest({**judged, _REAL: truth}, training, work, device)
-        comparisons = with_copies(comparisons, nearest, nearest.pop(_REAL))
-    _write(comparisons, {"real": truth, **judged}, options, device)
+    reference = options.reference, options.baselines
+    comparisons = evaluate(truth, judged, compare, training, *reference, device)
+    if rank_and_world_size()[0] == 0:  # the first process prints and writes the results
+        _write(comparisons, {"real": truth, **judged}, options, device)
 
 
 def _write(

@@ -91,15 +91,14 @@ class ScanFiles(ScanSource):
         return [*self.paths, *filter(None, found)]
 
     def _listed(self, *times: str) -> list[Any]:
-        """Names, sizes and times of change of the files, with labels also the ids' list."""
-        listed: list[Any] = [self.reading.label_ids.ids] if self.reading.labels else []
+        """Name, size and `times` (fields of `os.stat`) of each file; first the ids of labels."""
+        rows: list[Any] = [self.reading.label_ids.ids] if self.reading.labels else []
         for path in self._files():
             with suppress(OSError):  # reported when the scan is read
-                stat = os.stat(path)
-                changes = (getattr(stat, time) for time in times)
+                about = os.stat(path)
                 name = str(path).removeprefix(self._root)
-                listed.append([name, stat.st_size, *changes])
-        return listed
+                rows.append([name, about.st_size, *(getattr(about, time) for time in times)])
+        return rows
 
     def places(self) -> set[str]:
         real = cache(os.path.realpath)  # slow on network disks

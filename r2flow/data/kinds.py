@@ -131,16 +131,22 @@ class Layout(SourceKind):
         about = {"kind": "file" if scans.file else options.name}
         if self.splits:
             about["split"] = options.split or "all"
-        first = 0
-        numbers: dict[str, range] = {}
-        for drive in () if scans.file else scans.drives:
-            numbers[drive.name] = range(first, first + len(drive.scans))
-            first += len(drive.scans)
+        numbers = {} if scans.file else _numbers_of(scans.drives)
         return ScanFiles(scans.paths, reading, options.folder, numbers, about)
 
     def lacks_reflectance(self, scans: "Described", reading: HowRead) -> str | None:
         with leaving_out(reading.on_bad_scan == "error" and not scans.file):
             return lacks_reflectance(scans.paths, reading.on_bad_scan, reading.columns)
+
+
+def _numbers_of(drives: Sequence[Drive]) -> dict[str, range]:
+    """By drive: the numbers of its scans in the set."""
+    numbers = {}
+    first = 0
+    for drive in drives:
+        numbers[drive.name] = range(first, first + len(drive.scans))
+        first += len(drive.scans)
+    return numbers
 
 
 class _Prepared(SourceKind):

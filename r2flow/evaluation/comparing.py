@@ -89,7 +89,7 @@ class Comparer(Measurer):
     """
 
     folder: Path | None = None
-    _statistics: dict[ScanSet, dict[str, Statistics]] = field(default_factory=dict)
+    _statistics: dict[ScanSet, dict[str, Statistics]] = field(default_factory=dict, init=False)
 
     def __call__(self, kind: _Kind, name: str, real: ScanSet, other: ScanSet) -> Comparison:
         """Compare two sets, or read the stored results."""

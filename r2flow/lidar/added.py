@@ -16,6 +16,8 @@ from r2flow.lidar.sensors import Sensor
 
 _MEASURED = "measured"  # uint8: 1 for a point of the scan, 0 for an added one
 _TRUST = ("error_68", "error_95", "p_return")  # float32, see `Completed.trust`
+# Values of fields that added points lack, by the kind of their dtype; 0 of others.
+_EMPTY = {"f": np.nan, "c": np.nan, "M": "NaT", "m": "NaT", "O": None}
 ROW = "image_row"  # uint16: row of the answer's sensor from the top, of every point
 _NO_ROW = 65535  # of a measured point outside the view of the answer's sensor
 
@@ -109,7 +111,5 @@ def unknown_fields(cloud: Cloud) -> list[str]:
 
 def _unknown(column: ndarray, count: int) -> ndarray:
     """Values of a field, (count,), of points that have none: NaN, 0 or nothing."""
-    empty = {"f": np.nan, "c": np.nan, "M": "NaT", "m": "NaT", "O": None}
-    if column.dtype.kind in empty:
-        return np.full((count, *column.shape[1:]), empty[column.dtype.kind], column.dtype)
-    return np.zeros((count, *column.shape[1:]), column.dtype)
+    value = _EMPTY.get(column.dtype.kind, 0)
+    return np.full((count, *column.shape[1:]), value, column.dtype)

@@ -134,20 +134,23 @@ def _reflectance_pairs(scan: Scan) -> ndarray:
 
 
 def _rate_distance(a: ndarray, b: ndarray) -> float:
-    """Mean |x - y| of rates over bins of counts (missing, all, of images), 0 if empty.
+    """Distance between two sets by their shares of missing rays in bins; each set is (3, ...): the
+    missing rays of a bin, all rays of it, and all pixels of the images.
 
-    At least the share of a set's rays beyond 100 times the other's in their bin, which have no rate
-    to compare: 1 if the other has none. NaN without rays.
+    The mean over bins of |x - y| for shares x and y, 0 in an empty bin. A bin with 100 times as
+    many rays of one set has no shares to compare: the distance is at least the part of that set's
+    rays that are beyond this. NaN without rays.
     """
-    lost_a, rays_a, pixels_a = a.reshape(3, -1)
-    lost_b, rays_b, pixels_b = b.reshape(3, -1)
-    p = rays_a / pixels_a
-    q = rays_b / pixels_b
-    shares = [np.maximum(u - 100 * v, 0).sum() / u.sum() for u, v in ((p, q), (q, p)) if u.any()]
-    if not shares:
-        return float("nan")
-    difference = lost_a / np.maximum(rays_a, 1) - lost_b / np.maximum(rays_b, 1)
-    return float(max(np.abs(difference).mean(), *shares))
+    missing_a, rays_a, pixels_a = a.reshape(3, -1)
+    missing_b, rays_b, pixels_b = b.reshape(3, -1)
+    difference = missing_a / np.maximum(rays_a, 1) - missing_b / np.maximum(rays_b, 1)
+    distances = [np.abs(difference).mean()]
+    density_a = rays_a / pixels_a
+    density_b = rays_b / pixels_b
+    for one, other in ((density_a, density_b), (density_b, density_a)):
+        if one.any():
+            distances.append(np.maximum(one - 100 * other, 0).sum() / one.sum())
+    return float(max(distances)) if len(distances) > 1 else float("nan")
 
 
 def _row_distance(a: ndarray, b: ndarray) -> float:

@@ -139,20 +139,9 @@ def _build_data(
     run: RunConfig, options: Options, keys: Sequence[str], parent: Parent | None
 ) -> ScanDataModule:
     """The DataModule of a config, for the model's sensor and encoding."""
-    data = run.data
-    _refuse_unread(data.name, keys)
-    of_simulated = all(part.get("name") == SIMULATED for part in data.parts or [vars(data)])
-    drawer = parent
-    if data.name == PAIRS:
-        if parent is None:
-            raise InputError("data=pairs are drawn by a trained run: give stage.parent=RUN.")
-        drawer = find_parent(data.pairs.of) if data.pairs.of else parent
-    theirs = drawer.reading if drawer else None
-    if data.name == PAIRS:
-        data = replace(data, reading=theirs)
-    elif theirs and not of_simulated:  # the rays of simulated scans are given
-        usual = {"projection": theirs.projection, "convention": theirs.convention}
-        data = replace(data, reading=ReadingOptions(**{**usual, **data.reading_fields}))
+    _refuse_unread(run.data.name, keys)
+    drawer = _drawer(run.data, parent)
+    data = replace(run.data, reading=_reading(run.data, drawer))
     encoding = dict(options["encoding"])
     levels = encoding.get("levels")
     if parent is None:
@@ -164,14 +153,38 @@ def _build_data(
     )
     if module.encoding.levels is None:
         module.encoding.levels = levels
-    if parent and drawer and module.pairs:
-        for group in ("sensor", "encoding"):
-            if drawer.config.model[group] != parent.config.model[group]:
-                raise InputError(
-                    f"data.pairs.of={module.pairs.of} has another {group} than {parent.path}."
-                )
+    if drawer and module.pairs:
         module.drawn_by(drawer.record())
     return module
+
+
+def _drawer(data: DataOptions, parent: Parent | None) -> Parent | None:
+    """The model whose images the data must be like: the one that draws pairs, else the parent."""
+    if data.name != PAIRS:
+        return parent
+    if parent is None:
+        raise InputError("data=pairs are drawn by a trained run: give stage.parent=RUN.")
+    if not data.pairs.of:
+        return parent
+    drawer = find_parent(data.pairs.of)
+    for group in ("sensor", "encoding"):
+        if drawer.config.model[group] != parent.config.model[group]:
+            raise InputError(
+                f"data.pairs.of={data.pairs.of} has another {group} than {parent.path}."
+            )
+    return drawer
+
+
+def _reading(data: DataOptions, like: Parent | None) -> ReadingOptions | None:
+    """How scans become images: as those of another model where the config does not say it."""
+    theirs = like.reading if like else None
+    if data.name == PAIRS:
+        return theirs
+    simulated = all(part.get("name") == SIMULATED for part in data.parts or [vars(data)])
+    if theirs is None or simulated:  # the rays of simulated scans are given
+        return data.reading
+    inherited = {"projection": theirs.projection, "convention": theirs.convention}
+    return ReadingOptions(**{**inherited, **data.reading_fields})
 
 
 def _refuse_unread(name: str, keys: Sequence[str]) -> None:

@@ -186,10 +186,12 @@ def job_folder(given: Sequence[str], overrides: str) -> str:
     """Folder name of a sweep's job: the swept values, and a hash of all overrides."""
     parsed = OverridesParser.create().parse_overrides(list(given))
     swept = {one.get_key_element().lstrip("+~") for one in parsed if one.is_sweep_override()}
-    whole = re.split(r",(?=~|\+*[\w.@/]+=)", overrides)  # not at the commas of a list
-    parts = [part for part in whole if part.partition("=")[0].lstrip("+~") in swept]
-    readable = re.sub(r"[^\w.=+-]+", "_", ",".join(parts) or "job")[:80]
-    return f"{readable}-{hashlib.sha256(os.fsencode(overrides)).hexdigest()[:6]}"
+    before_a_key = r",(?=~|\+*[\w.@/]+=)"  # not the commas of a list
+    texts = re.split(before_a_key, overrides)
+    texts = [text for text in texts if text.partition("=")[0].lstrip("+~") in swept]
+    readable = re.sub(r"[^\w.=+-]+", "_", ",".join(texts) or "job")[:80]
+    digest = hashlib.sha256(os.fsencode(overrides)).hexdigest()
+    return f"{readable}-{digest[:6]}"
 
 
 def _look_at_scans(config: DictConfig, given: Sequence[str]) -> None:

@@ -116,10 +116,10 @@ class Diffusion(NetworkFlow):
             progress()
             return self.denoise(z, log_snr)
 
-        *_, z = repaint(
-            denoise, z, image, known, self.log_snrs(how, z), noise, how.repeats, how.jump
-        )
-        return self._clipped(z)
+        log_snrs = self.log_snrs(how, z)
+        states = repaint(denoise, z, image, known, log_snrs, noise, how.repeats, how.jump)
+        *_, completed = states
+        return self._clipped(completed)
 
 
 @dataclass(frozen=True)
