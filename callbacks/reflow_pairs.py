@@ -24,13 +24,13 @@ class ReflowPairs(L.Callback):
             raise InputError(
                 "pairs are drawn by a trained flow: give the stage a parent, or pairs={'of': RUN}."
             )
-        own = pl_module.backbone if pl_module.own_network else None
+        network = pl_module.backbone if pl_module.own_network else None
         if data.pairs.of:
-            record = find_parent(data.pairs.of, own).record()
+            record = find_parent(data.pairs.of, network).record()
         data.drawn_by(record)
         store = data.pair_store
         if store.missing_pairs():
             # File locks, not a barrier: collective calls time out after half an hour, and a slow
             # rank may take longer.
-            flow = load_checkpoint(record.path, backbone=own).generator
+            flow = load_checkpoint(record.path, backbone=network).generator
             make_pairs(store, flow.to(trainer.strategy.root_device))

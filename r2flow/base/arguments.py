@@ -31,9 +31,9 @@ class NamedArguments:
         super().__init_subclass__(**options)
         cls.__signature__ = None  # not that of the base
         cls.__signature__ = signature_of(cls)
-        before, own, after = _parts(cls.__dict__.get("__doc__"))
+        before, described, after = _parts(cls.__dict__.get("__doc__"))
         _, inherited, _ = _parts(cls.__base__.__doc__)
-        said = inherited | own
+        said = inherited | described
         listed = [said[name] for name in cls.__signature__.parameters if name in said]
         arguments = "\n".join(["Args:", *listed])
         cls.__doc__ = "\n\n".join(filter(None, [before, arguments, after]))

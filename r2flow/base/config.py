@@ -43,7 +43,7 @@ def rules_in(kind: Any) -> Mapping[str, Sequence[Rule]]:
         table[name] = [one for one in members if isinstance(one, Rule)]
         for group in filter(is_dataclass, members):
             if isinstance(group, type):
-                table |= {f"{name}.{key}": own for key, own in rules_in(group).items()}
+                table |= {f"{name}.{key}": rules for key, rules in rules_in(group).items()}
     return table
 
 

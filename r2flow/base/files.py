@@ -223,5 +223,5 @@ def reading_errors(path: Path) -> Iterator[None]:
 
 def cache_folder(variable: str, name: str = "") -> Path:
     """Folder in an environment variable; default: `name` in r2flow's folder of the user's cache."""
-    usual = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "r2flow", name)
-    return Path(os.environ.get(variable) or usual).expanduser()
+    default = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "r2flow", name)
+    return Path(os.environ.get(variable) or default).expanduser()

@@ -35,11 +35,11 @@ def take_plugins(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--plugin", action="append", default=[])
     try:
-        given, others = parser.parse_known_args(arguments)
+        parsed, others = parser.parse_known_args(arguments)
     except argparse.ArgumentError:
-        given = argparse.Namespace(plugin=[""])
-    check(all(given.plugin), "--plugin needs the name of a module, or a path ending in .py.")
-    return others, given.plugin
+        parsed = argparse.Namespace(plugin=[""])
+    check(all(parsed.plugin), "--plugin needs the name of a module, or a path ending in .py.")
+    return others, parsed.plugin
 
 
 def load_plugins(names: Sequence[str]) -> None:

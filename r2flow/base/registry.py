@@ -168,8 +168,8 @@ class Registry(Mapping[str, _T]):
     def name_of(self, entry: Any) -> str | None:
         """The name of an entry, or None."""
         place = f"{getattr(entry, '__module__', '')}:{getattr(entry, '__qualname__', '')}"
-        for name, own in self._entries.items():
-            if own is entry or own == _Lazy(place, ()):
+        for name, known in self._entries.items():
+            if known is entry or known == _Lazy(place, ()):
                 return name
         return None
 
@@ -270,19 +270,23 @@ def signature_of(constructor: Callable[..., Any]) -> inspect.Signature:
     that `**options: Unpack[TYPED_DICT]` names.
     """
     signature = inspect.signature(constructor)
-    own = list(signature.parameters.values())
-    if not (own and own[-1].kind is own[-1].VAR_KEYWORD and inspect.isclass(constructor)):
+    parameters = list(signature.parameters.values())
+    if not (
+        parameters
+        and parameters[-1].kind is parameters[-1].VAR_KEYWORD
+        and inspect.isclass(constructor)
+    ):
         return signature
     _, base, *_ = [one for one in constructor.__mro__ if "__init__" in vars(one)]
     inherited = signature_of(base).parameters
     passed = inherited.keys() - signature.parameters.keys()
-    for typed in get_args(own.pop().annotation):
+    for typed in get_args(parameters.pop().annotation):
         passed &= get_type_hints(typed).keys()
     taken = [p for p in inherited.values() if p.name in passed and p.kind not in _SEVERAL]
-    if not any(p.kind is p.VAR_POSITIONAL for p in own):
+    if not any(p.kind is p.VAR_POSITIONAL for p in parameters):
         taken = [p.replace(kind=p.KEYWORD_ONLY) for p in taken if p.kind is not p.POSITIONAL_ONLY]
-    own = [p for p in own if p.kind not in _SEVERAL]
-    return signature.replace(parameters=sorted([*own, *taken], key=lambda p: p.kind))
+    parameters = [p for p in parameters if p.kind not in _SEVERAL]
+    return signature.replace(parameters=sorted([*parameters, *taken], key=lambda p: p.kind))
 
 
 def _by_keyword(constructor: Callable[..., Any], given: int = 0) -> dict[str, inspect.Parameter]:

@@ -70,11 +70,11 @@ def sight(
     path = next(iter(scans))
     points = [*scans.values()]
     target = reading.sensor
-    own = SENSORS[target.name] if target.name in SENSORS else target  # noqa: SIM401
-    doubt = other_sensor(points, source or own)
+    trained = SENSORS[target.name] if target.name in SENSORS else target  # noqa: SIM401
+    doubt = other_sensor(points, source or trained)
     named = source is not None
-    if not source and not doubt and own.shape[0] < target.shape[0]:
-        source = own  # fewer beams than rows of the completions
+    if not source and not doubt and trained.shape[0] < target.shape[0]:
+        source = trained  # fewer beams than rows of the completions
     same = doubt is None
     if source:
         same = source.shape[0] >= target.shape[0] and source.resized(*target.shape).same_image(

@@ -173,23 +173,23 @@ class Generator(nn.Module):
         Without a name, it is `sampler`, or `few` for fewer steps. A name may have fields
         (`parse_sampler`). Another sampler keeps the number of steps, with defaults otherwise.
         """
-        given = {} if name is None else parse_sampler(str(name))
-        given |= {key: value for key, value in options.items() if value is not None}
-        name = given.pop("name", None)
+        fields = {} if name is None else parse_sampler(str(name))
+        fields |= {key: value for key, value in options.items() if value is not None}
+        name = fields.pop("name", None)
         default = self.sampler
         steps = getattr(default, "steps", None)
         if self.few:
-            asked = given.get("steps")
+            asked = fields.get("steps")
             fewer = steps and hasattr(asked, "__index__") and asked < steps
             if fewer if name is None else name == self.few.name:
                 default = self.few
                 steps = None
         if name is not None and name != default.name:
-            if "grid" not in given and "steps" in options_of(SAMPLERS[name]):
-                given = {"steps": steps, **given}
-            sampler = build_sampler({"name": name, **given})
-        elif given:
-            sampler = default.changed(**given)
+            if "grid" not in fields and "steps" in options_of(SAMPLERS[name]):
+                fields = {"steps": steps, **fields}
+            sampler = build_sampler({"name": name, **fields})
+        elif fields:
+            sampler = default.changed(**fields)
         else:
             return default
         sampler.check(self)

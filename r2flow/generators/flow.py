@@ -162,8 +162,8 @@ class Conditioned:
         return self.flow.mean_velocity(t, x, s, self.condition)
 
     def select(self, scenes: Tensor) -> "Conditioned":
-        chosen = {name: value[scenes.to(value.device)] for name, value in self.condition.items()}
-        return Conditioned(self.flow, chosen)
+        condition = {name: value[scenes.to(value.device)] for name, value in self.condition.items()}
+        return Conditioned(self.flow, condition)
 
 
 class FlowMap(RectifiedFlow):

@@ -137,8 +137,8 @@ class TransferFlow(Flow):
         """A parent's weight with zeros for the channels of labels, which are the last."""
         if not name.startswith(("backbone.image.", "backbone.answer.")):
             return weight
-        own = self.get_parameter(name)
-        wide = torch.zeros_like(own)
+        widened = self.get_parameter(name)
+        wide = torch.zeros_like(widened)
         wide[tuple(map(slice, weight.shape))] = weight
         return wide
 

@@ -436,11 +436,13 @@ def check_weights(model: nn.Module, weights: Mapping[str, Tensor]) -> None:
     names = f"{len(missing)} names missing {missing[:2]}, {len(surplus)} unknown {surplus[:2]}"
     check(not (missing or surplus), f"{unlike} {names}.")
     for name, value in expected.items():
-        given = weights[name]
-        fits = given.shape == value.shape and given.is_floating_point() == value.is_floating_point()
-        found = f"'{name}' has shape {tuple(given.shape)} ({given.layout}, {given.dtype})"
+        weight = weights[name]
+        fits = (
+            weight.shape == value.shape and weight.is_floating_point() == value.is_floating_point()
+        )
+        found = f"'{name}' has shape {tuple(weight.shape)} ({weight.layout}, {weight.dtype})"
         check(
-            fits and is_dense(given),
+            fits and is_dense(weight),
             f"{unlike} {found}, the config makes it {tuple(value.shape)} ({value.dtype}).",
         )
     # buffers may be infinite, as the mask of an attention

@@ -108,13 +108,15 @@ def export_completion(checkpoint: Checkpoint, path: str | Path, source: Sensor |
     flow = checkpoint.generator
     source = named_sensor(source)
     rows, columns = checkpoint.sensor.shape
-    own = source.shape[0] >= rows and source.resized(rows, columns).same_image(checkpoint.sensor)
+    whole = source.shape[0] >= rows and source.resized(rows, columns).same_image(checkpoint.sensor)
     if not isinstance(flow, TransferFlow):
         raise InputError(f"{checkpoint.path} is no transfer flow, as densify: use `export`.")
     check(not flow.classes, f"{checkpoint.path} has labels, which no file completes: give densify.")
     check(path.suffix == ".onnx", f"a transfer flow is exported as .onnx, found {path}.")
     check(flow.sampler == Jump(steps=1), "only a transfer flow with the sampler jump is exported.")
-    check(not own, f"scans of {source.name} have all rows of {checkpoint.sensor}: give more rows.")
+    check(
+        not whole, f"scans of {source.name} have all rows of {checkpoint.sensor}: give more rows."
+    )
     require("an .onnx", "export", "onnx", "onnxscript", "onnxruntime")
     from r2flow.model.onnx_graphs import to_onnx
 

@@ -113,11 +113,11 @@ def model_options(
     generator = _generator(given.get("generator"), of_parent, generator_name)
     options: Config = {}
     for group, (default, complete) in _GROUPS.items():
-        own = given.get(group)
+        ours = given.get(group)
         if parent is None:
-            options[group] = complete(own or default)
+            options[group] = complete(ours or default)
         else:
-            options[group] = _changed(theirs[group], own, complete)
+            options[group] = _changed(theirs[group], ours, complete)
     encoding = options["encoding"]
     if encoding["reflectance"] == AUTO:
         encoding["reflectance"] = parent is None or parent.config.encoding["reflectance"]
@@ -164,9 +164,9 @@ def _generator(given: str | Options | None, theirs: Options | None, of_stage: st
     if given:
         return GENERATORS.options(given)
     parental = theirs or {"name": "rectified_flow"}
-    chosen = of_stage or GENERATORS[parental["name"]].finetuned_as or parental["name"]
-    shared = options_of(GENERATORS[chosen], given=2)
-    return {"name": chosen} | {key: parental[key] for key in parental if key in shared}
+    name = of_stage or GENERATORS[parental["name"]].finetuned_as or parental["name"]
+    shared = options_of(GENERATORS[name], given=2)
+    return {"name": name} | {key: parental[key] for key in parental if key in shared}
 
 
 def plain(value: Any) -> Any:

@@ -134,8 +134,10 @@ class Ablation:
             choices.append(values)
         swept = [one.is_sweep_override() for one in self._parsed]
         return {
-            ", ".join(text.partition("=")[2] for text in compress(own, swept)): list(own)
-            for own in product(*choices)
+            ", ".join(text.partition("=")[2] for text in compress(overrides, swept)): list(
+                overrides
+            )
+            for overrides in product(*choices)
         }
 
     @property
@@ -161,8 +163,8 @@ class Ablation:
 
     def simulated(self) -> str:
         """Held-out simulated scans for runs on simulated scans; others have to be named."""
-        for own in self.variants.values():
-            if compose(own)["data"]["name"] != SIMULATED:
+        for overrides in self.variants.values():
+            if compose(overrides)["data"]["name"] != SIMULATED:
                 raise InputError("name scans that no run trains on, by --real SCANS.")
         return _HELD_OUT
 
@@ -184,16 +186,16 @@ class Ablation:
 
     def _changed(self, seed: int, name: str, link: str = "", *keys: str) -> list[Link]:
         """The links of a run, one of them with further keys."""
-        own = [*self.variants[name], f"seed={seed}"]
+        overrides = [*self.variants[name], f"seed={seed}"]
         folder = self.out / f"{self.seconds:g}s"
-        folder /= job_folder([*self.keys, "seed=0,1"], ",".join(own))
-        given = [*_DEFAULTS, *own]
+        folder /= job_folder([*self.keys, "seed=0,1"], ",".join(overrides))
+        composed = [*_DEFAULTS, *overrides]
         with naming(name):
-            chain = compose(given)["chain"]
+            chain = compose(composed)["chain"]
             if chain is not None:
-                return links_of(chain, folder, [*given, *(f"+chain.{link}.{k}" for k in keys)])
-            given += [*keys, override("run_dir", str(folder))]
-            return [Link("", RunConfig.of(compose(given)), tuple(given))]
+                return links_of(chain, folder, [*composed, *(f"+chain.{link}.{k}" for k in keys)])
+            composed += [*keys, override("run_dir", str(folder))]
+            return [Link("", RunConfig.of(compose(composed)), tuple(composed))]
 
     def check(self) -> None:
         """Refuse what a run of the first seed would refuse, before any is trained."""

@@ -126,13 +126,13 @@ def check(
 
 def _given(run: RunConfig, keys: Sequence[str], parent: Parent | None) -> Config:
     """Options of the model; next to a parent's, only those of the command line."""
-    given: Config = {group: getattr(run, group) for group in MODEL}
+    groups: Config = {group: getattr(run, group) for group in MODEL}
     if parent is not None:
         for group in ("backbone", "sensor", "encoding"):
             if group not in keys:
-                options = given[group] or {}
-                given[group] = {k: options[k] for k in options if f"{group}.{k}" in keys} or None
-    return given
+                options = groups[group] or {}
+                groups[group] = {k: options[k] for k in options if f"{group}.{k}" in keys} or None
+    return groups
 
 
 def _build_data(
@@ -189,14 +189,14 @@ def _reading(data: DataOptions, like: Parent | None) -> ReadingOptions | None:
 
 def _refuse_unread(name: str, keys: Sequence[str]) -> None:
     """Refuse keys of the command line that this kind of data does not read."""
-    given = {".".join(key.split(".")[:2]) for key in keys}
-    if name not in (SIMULATED, MIXED, PAIRS) and "data.scenes" in given:
+    groups = {".".join(key.split(".")[:2]) for key in keys}
+    if name not in (SIMULATED, MIXED, PAIRS) and "data.scenes" in groups:
         raise InputError("scans in files are no simulated scenes: leave data.scenes out.")
-    if name == SIMULATED and "data.reading" in given:
+    if name == SIMULATED and "data.reading" in groups:
         raise InputError("simulated scans are not read from files: leave data.reading out.")
-    if name == PAIRS and "data.reading" in given:
+    if name == PAIRS and "data.reading" in groups:
         raise InputError("data.reading is that of the flow that draws the pairs: leave it out.")
-    if name != PAIRS and "data.pairs" in given:
+    if name != PAIRS and "data.pairs" in groups:
         raise InputError(f"data={name} has no pairs (data=pairs has): leave data.pairs out.")
 
 

@@ -32,14 +32,14 @@ class Link:
 
 
 def links_of(
-    chain: Options, folder: Path, given: Sequence[str], configs: Sequence[str] = ()
+    chain: Options, folder: Path, overrides: Sequence[str], configs: Sequence[str] = ()
 ) -> list[Link]:
     """The runs of a chain in the order of their parents; `parent` names a link's parent.
 
-    The user's command line, `given`, follows each link's own keys, as far as it concerns the link.
+    The user's command line, `overrides`, follows each link's own keys, as far as it concerns the link.
     `configs` are further folders of configs.
     """
-    if any(key_of(text) == "stage.parent" for text in given):
+    if any(key_of(text) == "stage.parent" for text in overrides):
         raise InputError(
             "stage.parent is each link's own: give +chain.LINK.stage.parent=RUN to one of them."
         )
@@ -60,9 +60,9 @@ def links_of(
             stage["parent"] = str(Path(folder, parent))
         # Overrides given for this link alone come last: they replace the link's own keys.
         prefix = re.compile(rf"\+*chain\.{re.escape(name)}\.(?!parent=)")
-        alone = [prefix.sub("", text, count=1) for text in given if prefix.match(text)]
+        alone = [prefix.sub("", text, count=1) for text in overrides if prefix.match(text)]
         run_dir = override("run_dir", str(Path(folder, name)))
-        links.append(_link(name, settings, [*given], [*alone, run_dir], parent, configs))
+        links.append(_link(name, settings, [*overrides], [*alone, run_dir], parent, configs))
     return links
 
 
@@ -77,9 +77,9 @@ def _checked(name: Any, keys: Any) -> Config:
         raise InputError(
             f"chain.{name}.plugins: plug-ins are given to all links, as --plugin MODULE."
         )
-    own = {key: dict(one) if isinstance(one, Mapping) else one for key, one in keys.items()}
-    stage = own.get("stage") or {}
-    return {**own, "stage": {"name": stage} if isinstance(stage, str) else stage}
+    groups = {key: dict(one) if isinstance(one, Mapping) else one for key, one in keys.items()}
+    stage = groups.get("stage") or {}
+    return {**groups, "stage": {"name": stage} if isinstance(stage, str) else stage}
 
 
 def _link(

@@ -80,12 +80,12 @@ def _with_keys(keys: Options) -> list[str]:
     """The choices among a link's keys; its values become a config of Hydra's."""
     values = {key: dict(one) if isinstance(one, Mapping) else one for key, one in keys.items()}
     named = [group for group in _GROUPS if isinstance(values.get(group), str)]
-    chosen = [override(group, values.pop(group)) for group in named]
+    choices = [override(group, values.pop(group)) for group in named]
     if "name" in values.get("stage", ()):
-        chosen.append(override("stage", values["stage"].pop("name")))
+        choices.append(override("stage", values["stage"].pop("name")))
     values.pop("experiment", None)  # null
     ConfigStore.instance().store("keys", values, group="link", package="_global_")
-    return [*as_hydra_takes(chosen), "+link@_global_=keys"]
+    return [*as_hydra_takes(choices), "+link@_global_=keys"]
 
 
 @contextmanager
@@ -215,10 +215,10 @@ def _replaces(parsed: Override) -> bool:
 def _sensor_of_file(path: str, overrides: Sequence[str]) -> list[str]:
     from r2flow.lidar.sensors import options_of_sensor, read_sensor
 
-    given = set(map(key_of, overrides))
+    keys = set(map(key_of, overrides))
     options = options_of_sensor(read_sensor(path))
     return [
         override(f"++sensor.{name}", options[name])
         for name in options
-        if f"sensor.{name}" not in given
+        if f"sensor.{name}" not in keys
     ]

@@ -91,10 +91,10 @@ def main(arguments: Sequence[str], command: Sequence[str], plugins: Sequence[str
 
 def _with_plugins(arguments: Sequence[str], plugins: Sequence[str]) -> list[str]:
     """Load the plug-ins of a command line and collect them into one `plugins=[...]`."""
-    given = [text for text in arguments if text.lstrip("+").startswith("plugins=")]
-    others = [text for text in arguments if text not in given]
+    named = [text for text in arguments if text.lstrip("+").startswith("plugins=")]
+    others = [text for text in arguments if text not in named]
     names = list(plugins)
-    for text in given:
+    for text in named:
         names += re.findall(r"[^\[\], '\"]+", text.partition("=")[2])
     if not names:
         return others
@@ -141,7 +141,7 @@ def _run_hydra(
     def job(config: DictConfig) -> float | None:
         sys.argv = original  # Lightning starts the processes of other devices by it
         try:
-            given = list(HydraConfig.get().overrides.task)
+            overrides = list(HydraConfig.get().overrides.task)
             # The command line, not the overrides: a config file can make a sweeper add overrides.
             named_here = any(text.startswith("plugins=") for text in parsed.overrides)
             plugins = config["plugins"]
@@ -152,19 +152,19 @@ def _run_hydra(
                 )
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 if HydraConfig.get().job.num == 0:
-                    _look_at_scans(config, given)
+                    _look_at_scans(config, overrides)
                 if any(not isinstance(error, _JobEnded) for error in errors):
                     return None  # all jobs would end as the first one
-                return _sweep_job(command, given, config["metric"])
+                return _sweep_job(command, overrides, config["metric"])
             settings = plain(config)
             # imported here, so that Hydra's errors are reported before torch is loaded
             from r2flow.training import RunConfig, build, fit
 
             run = RunConfig.of(settings)
             if run.chain is not None:
-                codes.append(_chain(run, run.chain, given, folders))
+                codes.append(_chain(run, run.chain, overrides, folders))
             else:
-                codes.append(0 if fit(build(run, given)).finished else LATER)
+                codes.append(0 if fit(build(run, overrides)).finished else LATER)
         except Exception as error:
             if os.getpid() != launcher:  # a remote launcher sees only exceptions, after all jobs
                 raise
@@ -194,7 +194,7 @@ def job_folder(given: Sequence[str], overrides: str) -> str:
     return f"{readable}-{digest[:6]}"
 
 
-def _look_at_scans(config: DictConfig, given: Sequence[str]) -> None:
+def _look_at_scans(config: DictConfig, overrides: Sequence[str]) -> None:
     """Refuse scans in files that no job of a sweep could train on, once; what else is wrong with a
     job, that says itself.
     """
@@ -206,19 +206,19 @@ def _look_at_scans(config: DictConfig, given: Sequence[str]) -> None:
         first = RunConfig.of(plain(config))
         if first.chain or first.data.name in (SIMULATED, PAIRS):
             return
-        run = build(first, given)
+        run = build(first, overrides)
     except InputError:
         return
     if run.stage.encoding.reflectance:
         check_intensities(run.data.plan)
 
 
-def _sweep_job(command: Sequence[str], given: Sequence[str], metric: str) -> float | None:
+def _sweep_job(command: Sequence[str], overrides: Sequence[str], metric: str) -> float | None:
     """Run a job of a sweep in its own process, so that its failure or DDP relaunch does not affect
     other jobs; the last value of a metric, for the sweeper, None if the run did not log it.
     """
     run_dir = HydraConfig.get().runtime.output_dir
-    code = run_process([*command, *given, override("run_dir", str(run_dir))])
+    code = run_process([*command, *overrides, override("run_dir", str(run_dir))])
     if code in map(code_of, STOPPING):
         raise Stopped(code, "the sweep stopped; the same command resumes there")
     if code:
@@ -229,7 +229,9 @@ def _sweep_job(command: Sequence[str], given: Sequence[str], metric: str) -> flo
     return values[-1] if values[-1] is None else float(values[-1])
 
 
-def _chain(run: "RunConfig", chain: Options, given: Sequence[str], folders: Sequence[str]) -> int:
+def _chain(
+    run: "RunConfig", chain: Options, overrides: Sequence[str], folders: Sequence[str]
+) -> int:
     from r2flow.reports.chain import REPORT, report_chain
     from r2flow.runs.chain import check_links, links_of, train_links
     from r2flow.runs.folder import has_ended
@@ -239,7 +241,7 @@ def _chain(run: "RunConfig", chain: Options, given: Sequence[str], folders: Sequ
             "a chain's links start from earlier runs, and trainer.fast_dev_run leaves none."
         )
     folder = Path(run.run_dir)
-    links = links_of(chain, folder, given, folders)
+    links = links_of(chain, folder, overrides, folders)
     finished = all(has_ended(link.config.run_dir) for link in links)
     if not finished:
         check_links(links)

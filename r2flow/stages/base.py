@@ -181,13 +181,13 @@ class Stage(L.LightningModule, NamedArguments):
         elif parent is None and (self.needs_parent or self.needs_pairs):
             raise InputError(f"{type(self).__name__} starts from a trained model: give parent=RUN.")
         else:
-            given = {
+            groups = {
                 "backbone": backbone,
                 "sensor": sensor,
                 "encoding": encoding,
                 "generator": generator,
             }
-            options = model_options(given, source, self.generator_name, self.needs_pairs)
+            options = model_options(groups, source, self.generator_name, self.needs_pairs)
             seed_torch(seed, "weights")  # also of networks that a subclass adds
             self.generator = build_generator(options)
         if not isinstance(self.generator, self.learns):
@@ -200,22 +200,22 @@ class Stage(L.LightningModule, NamedArguments):
         if source and source.checkpoint:
             self.generator.start_from(source.checkpoint.generator)
         self.prepare_generator()
-        chosen = {"name": sampler} if isinstance(sampler, str) else sampler or {}
-        own = self.generator.choose(**chosen)
-        if own.completes:
+        fields = {"name": sampler} if isinstance(sampler, str) else sampler or {}
+        default = self.generator.choose(**fields)
+        if default.completes:
             raise InputError(
-                f"sampler {own.name} completes scans: give it to r2flow complete by --sampler."
+                f"sampler {default.name} completes scans: give it to r2flow complete by --sampler."
             )
         if few is not None:
             self.generator.few = build_sampler(few)
             self.generator.few.check(self.generator)
-        self.generator.sampler = own
+        self.generator.sampler = default
         self.parent: ParentRecord | None = source.record() if source else None
         if isinstance(parent, Mapping):
             self.parent = construct("parent", ParentRecord, parent)
         record = asdict(self.parent) if self.parent else None
         # kept, since a subclass may save its own arguments over them
-        self._built_with = plain({**options, "parent": record, "sampler": own.asdict()})
+        self._built_with = plain({**options, "parent": record, "sampler": default.asdict()})
         self.save_hyperparameters({**plain(dict(self.hparams)), **self._built_with})
         self.gradient_clip_val: float | None = None
 

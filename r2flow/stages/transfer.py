@@ -73,8 +73,8 @@ class Tasks:
             elevations = elevations.unflatten(0, (-1, 2)).mean(1)
         rows, columns = self.size(own)
         first = int(top * (x_1.shape[1] - rows + 1))
-        chosen = (torch.arange(columns) + int(left * x_1.shape[2])) % x_1.shape[2]
-        part = x_1[:, first : first + rows].index_select(2, chosen)
+        turned = (torch.arange(columns) + int(left * x_1.shape[2])) % x_1.shape[2]
+        part = x_1[:, first : first + rows].index_select(2, turned)
         elevations = elevations[first : first + rows].clone()
         steps = steps_of(elevations[None], 2 * math.pi / x_1.shape[2])[0]
         known = torch.from_numpy(_measured((rows, columns), draws)).expand_as(part).float()
