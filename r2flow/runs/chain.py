@@ -36,7 +36,7 @@ def links_of(
 ) -> list[Link]:
     """The runs of a chain in the order of their parents; `parent` names a link's parent.
 
-    The user's command line, `overrides`, follows each link's own keys, as far as it concerns the link.
+    The command line, `overrides`, follows each link's own keys, as far as it concerns the link.
     `configs` are further folders of configs.
     """
     if any(key_of(text) == "stage.parent" for text in overrides):
