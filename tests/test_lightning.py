@@ -12,7 +12,7 @@ from pathlib import Path
 import lightning as L
 import pytest
 import torch
-from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
+from lightning.pytorch.callbacks import BasePredictionWriter, EarlyStopping, ModelCheckpoint
 from r2flow.callbacks import EMA, ReflowPairs
 from torch.utils.data import DataLoader
 
@@ -445,6 +445,21 @@ def test_processes_measure_as_one(tmp_path: Path, devices: int, scenes: int):
     for one in shared:
         # the weights differ by the order of sums
         assert one[:2] == [pytest.approx(loss, rel=1e-5), pytest.approx(panel, abs=1e-5)]
+
+
+class Writer(BasePredictionWriter):
+    def write_on_epoch_end(self, trainer, module, predictions, batch_indices):
+        self.written = torch.cat(predictions)
+        self.numbers = batch_indices
+
+
+def test_a_writer_of_predictions_is_told_the_scans_by_number(tmp_path: Path):
+    writer = Writer("epoch")
+    data = ScanDataModule("simulated", sensor=SENSOR, scenes=20, batch_size=3)
+    trainer = quiet_trainer(tmp_path, callbacks=[writer])
+    trainer.predict(flow(), data, return_predictions=False)
+    assert writer.numbers == [[[0, 1, 2], [3, 4]]]  # one loader of two batches
+    assert writer.written.shape == (5, 2, 8, 64)
 
 
 class Saving(Rectify):

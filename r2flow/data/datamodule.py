@@ -390,7 +390,7 @@ class ScanDataModule(L.LightningDataModule, NamedArguments):
             # Devices with a scan more would have a batch more, and wait for the others.
             sizes = [size for size in range(2, least + 2) if least % size]
             batch_size = min(sizes, key=lambda size: abs(size - batch_size))
-        sampler = RunSampler(range(len(source)), len(source), rank, ranks, lambda: (0, 0))
+        sampler = RunSampler(None, len(source), rank, ranks, lambda: (0, 0))
         return self._loader(self._dataset(source, "validation", whole), sampler, batch_size)
 
     def _loader(

@@ -121,21 +121,21 @@ class Permutations:
 
 @dataclass(eq=False)
 class RunSampler(DistributedSampler[Key]):
-    """The images of one rank in an epoch of a run, or a validation, as (k, scan).
+    """The images of one rank in an epoch of a run as (k, scan), or scans held out by number.
 
     An epoch of n images is the range [first, first + n) of k, of which rank r of R takes first + r,
     first + r + R, ... So batches of b images on each rank are the global batches of b R images,
     whatever R is. Lightning leaves a `DistributedSampler` as it is.
 
     Args:
-        order: Maps k to a scan.
+        order: Maps k to a scan; None: k is the number of the scan.
         images: Number n of images of an epoch, on all ranks.
         rank, ranks: 0 ranks: those of the process group that runs.
         place: Gives the next k of the run, and the number of images of this epoch before it, which
             a resumed run skips; None: the first k of the epoch that `set_epoch` names.
     """
 
-    order: Order
+    order: Order | None
     images: int
     rank: int = 0
     ranks: int = 0
@@ -149,11 +149,11 @@ class RunSampler(DistributedSampler[Key]):
         rank, ranks = self._share()
         return len(range(rank, self.images, ranks))
 
-    def __iter__(self) -> Iterator[tuple[int, int]]:
+    def __iter__(self) -> Iterator[Key]:
         first, done = self.place() if self.place else (self.epoch * self.images, 0)
         rank, ranks = self._share()
         for k in range(first + rank, first + self.images - done, ranks):
-            yield k, self.order[k]
+            yield k if self.order is None else (k, self.order[k])
 
 
 class Mixture(ScanSource):
