@@ -139,7 +139,7 @@ def _describe_batch(trainer: L.Trainer) -> str:
     """
     sampler = getattr(trainer.train_dataloader, "sampler", None)
     size = getattr(trainer.datamodule, "batch_size", None)  # type: ignore[attr-defined]
-    if not isinstance(sampler, RunSampler) or size is None:
+    if not isinstance(sampler, RunSampler) or sampler.order is None or size is None:
         return "images unknown to the loader"
     images = range(trainer.global_step * size, (trainer.global_step + 1) * size)
     scans = ", ".join(str(sampler.order[k]) for k in images)

@@ -455,7 +455,9 @@ class Writer(BasePredictionWriter):
 
 def test_a_writer_of_predictions_is_told_the_scans_by_number(tmp_path: Path):
     writer = Writer("epoch")
-    data = ScanDataModule("simulated", sensor=SENSOR, scenes=20, batch_size=3)
+    data = ScanDataModule(
+        "simulated", sensor=SENSOR, scenes=10, batch_size=3, validation={"share": 0.5}
+    )
     trainer = quiet_trainer(tmp_path, callbacks=[writer])
     trainer.predict(flow(), data, return_predictions=False)
     assert writer.numbers == [[[0, 1, 2], [3, 4]]]  # one loader of two batches
