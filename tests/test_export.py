@@ -252,7 +252,7 @@ def test_an_exported_completion_is_that_of_the_flow(tmp_path):
     xyz = 9 * np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)]).reshape(3, -1)
     points = np.vstack([xyz, np.full_like(xyz[:1], 0.5)]).T
     session = onnxruntime.InferenceSession(written.path)
-    scan, completed, measured = session.run(None, {"points": points})
+    scan, completed, measured, _ = session.run(None, {"points": points})
     assert scan.shape == (2, 16, 64)
     assert set(map(tuple, completed[measured])) <= set(map(tuple, points))
     ranges = np.linalg.norm(completed[:, :3], axis=1)
@@ -295,10 +295,10 @@ NAN = np.full((3, 4), np.nan, np.float32)
 def test_a_scan_without_a_return_in_view_is_refused_and_in_an_export_stays_empty(odd, completion):
     checkpoint, source, session = completion
     points = odd(spheres(source, 9.0))
-    scan, completed, measured = session.run(None, {"points": points})
+    scan, completed, measured, error = session.run(None, {"points": points})
     assert not scan.any()
     assert completed.shape == (0, 4)
-    assert measured.shape == (0,)
+    assert measured.shape == error.shape == (0,)
     with pytest.raises(InputError):
         checkpoint.complete(points, sensor=source, precision="32-true")
 
@@ -317,9 +317,13 @@ def test_a_scan_without_a_return_in_view_is_refused_and_in_an_export_stays_empty
 def test_an_export_completes_odd_scans_as_the_flow_does(odd, completion):
     checkpoint, source, session = completion
     points = np.ascontiguousarray(odd(spheres(source, 9.0, 30.0, 79.0)))
-    scan, completed, measured = session.run(None, {"points": points})
+    scan, completed, measured, error = session.run(None, {"points": points})
     (expected,) = checkpoint.complete(points, sensor=source, precision="32-true")[0].numpy()
     np.testing.assert_allclose(scan, expected, atol=2e-3)
+    whole = checkpoint.completer(source, precision="32-true")(points)
+    errors = whole["error_68"][whole["measured"] == 0]
+    assert not error[measured].any()
+    np.testing.assert_allclose(np.sort(error[~measured]), np.sort(errors), rtol=1e-3)
     assert len(completed) == np.count_nonzero(expected[0])
     given = points[np.isfinite(points).all(axis=1)]
     assert measured.sum() > 0
@@ -329,8 +333,8 @@ def test_an_export_completes_odd_scans_as_the_flow_does(odd, completion):
 def test_an_exported_completion_says_what_it_takes(completion):
     _, source, session = completion
     said = [*session.get_inputs(), *session.get_outputs()]
-    assert [value.name for value in said] == ["points", "scan", "completed", "measured"]
-    assert [value.shape for value in said] == [["N", 4], [2, 16, 64], ["M", 4], ["M"]]
+    assert [value.name for value in said] == ["points", "scan", "completed", "measured", "error_68"]
+    assert [value.shape for value in said] == [["N", 4], [2, 16, 64], ["M", 4], ["M"], ["M"]]
     (beside,) = Path(session._model_path).parent.glob("*.json")
     notes = json.loads(beside.read_text())
     assert notes == json.loads(session.get_modelmeta().custom_metadata_map["r2flow"])

@@ -148,7 +148,7 @@ class Answers:
         errors = r.new_zeros(len(levels), r.numel())
         wanted = [math.log(-math.log1p(-level)) for level in levels]
         density = [x.movedim(1, 0).flatten(1) for x in (self.logits, self.ranges, self.scales)]
-        for rays in asked.split(RAYS):
+        for rays in (asked,) if torch.compiler.is_exporting() else asked.split(RAYS):
             metres = r.flatten()[rays]
             logits, ranges, scales = (x.index_select(1, rays) for x in density)
             if self.calibration is not None:

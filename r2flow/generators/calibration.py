@@ -33,10 +33,10 @@ def mixture(
     mean = (p * ranges).sum(0)
     spread = (p * ((ranges - mean).abs() + scales)).sum(0)
     features = torch.stack(
-        [torch.ones_like(mean), (spread.clamp(_NEAR, 1).log() + 3) / 2, mean - math.log(10)]
+        [torch.ones_like(mean), (spread.clamp(_NEAR, 1.0).log() + 3) / 2, mean - math.log(10)]
     )
     a, c, e, d, t = weights @ features
-    wide = torch.hypot(scales * a.exp(), (c - mean).exp())
+    wide = ((scales * a.exp()).square() + (2 * (c - mean)).exp()).sqrt()
     logits = (logits.clamp(min=-50) * t.exp()).log_softmax(0)
     return (
         torch.cat([logits + F.logsigmoid(-e), F.logsigmoid(e)[None]]),

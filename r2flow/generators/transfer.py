@@ -274,7 +274,8 @@ class TransferFlow(Flow):
     def _estimate(self, t: Tensor, x: Tensor, condition: Condition) -> Tensor:
         """The point estimate of x_1, computed where a ray is hidden and likely to return alone."""
         if torch.compiler.is_exporting():  # runtimes prefer fixed shapes
-            return self._chosen(self._answered(t, x, condition))
+            self.density = self._answered(t, x, condition)
+            return self._chosen(self.density)
         known = condition[KNOWN]
         asked = (known < 1).any(1, keepdim=True) & within_reach(known.amax(1, True))
         near = self._rows_near(asked)

@@ -37,9 +37,13 @@ from r2flow.model.export import (
 )
 from r2flow.samplers import Jump
 
-_SCAN = "(2 or 1, H, W): range in metres, reflectance of [0, 1]; 0: no return"
-_AXES = {"points": "N", "completed": "M", "measured": "M"}
-_POINTS = "(M, 4): x ahead, y left, z up in metres, reflectance"
+_AXES = {"points": "N", "completed": "M", "measured": "M", "error_68": "M"}
+_OUTPUTS = {
+    "scan": "(2 or 1, H, W): range in metres, reflectance of [0, 1]; 0: no return",
+    "completed": "(M, 4): x ahead, y left, z up in metres, reflectance",
+    "measured": "(M,): whether the point is one of the input",
+    "error_68": "(M,): metres within which the range is right in 68 %; 0: measured",
+}
 
 
 class _OneJump(Sampler):
@@ -65,13 +69,14 @@ class _Completion(nn.Module):
         self.sight = Sight(source, flow.space.sensor)
         self.register_buffer("noise", Draws(0, [0]).start(flow.noise_shape))
 
-    def forward(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         space = self.flow.space
         image, state, xyz = self.sight(points)
         # The third channel, without a label, lets reflectance of only 0 count as not measured.
         images = torch.cat([image, torch.zeros_like(image[:1])])[None]
         condition = condition_of(space, images, state[None])
-        x_1 = self.flow(self.noise, condition, sampler=_OneJump()).x
+        generated = self.flow(self.noise, condition, sampler=_OneJump())
+        x_1 = generated.x
         channels = 1 + space.encoding.reflectance
         known = condition[KNOWN][0, :channels] > 0
         scan = torch.where(known, image[:channels], space.decode(x_1)[0, :channels])
@@ -81,10 +86,13 @@ class _Completion(nn.Module):
         measured = state == Ray.RETURN
         xyz = torch.where(measured, xyz, unproject(scan[None, :1], rays)[0])
         strength = scan[1:2] if channels > 1 else torch.zeros_like(scan)
+        assert generated.density is not None
+        (error,) = generated.density.error(scan[None, :1], [0.68])
         order = (rays[1, 0] % (2 * pi)).argsort()
-        values = torch.cat([xyz, strength, measured[None]])[..., order].flatten(1).mT
+        values = torch.cat([xyz, strength, error, measured[None]])[..., order].flatten(1).mT
         returned = (scan[0][:, order] > 0).flatten().nonzero()[:, 0]
-        return scan, values[returned, :4], values[returned, 4] > 0
+        values = values[returned]
+        return scan, values[:, :4], values[:, 5] > 0, values[:, 4]
 
 
 def export_completion(checkpoint: Checkpoint, path: str | Path, source: Sensor | str) -> Exported:
@@ -92,9 +100,10 @@ def export_completion(checkpoint: Checkpoint, path: str | Path, source: Sensor |
 
     The input is `points` (N, 4) float32: x ahead, y left, z up in metres, and reflectance of [0,
     1], throughout 0 if unknown. The outputs are `scan` (2 or 1, H, W), range in metres and
-    reflectance, 0 without a return, `completed` (M, 4), its points as the input's, and `measured`
-    (M,) bool, which of these are points of the input, unchanged. A scan without a return in view
-    gives M = 0. A `.json` beside the file has its metadata: sensors, size, limits, weights.
+    reflectance, 0 without a return, `completed` (M, 4), its points as the input's, `measured` (M,)
+    bool, which of these are points of the input, unchanged, and `error_68` (M,), the predicted
+    error in metres (`Completed.error`). A scan without a return in view gives M = 0. A `.json`
+    beside the file has its metadata: sensors, size, limits, weights.
 
     Args:
         checkpoint: Of the sensor of the completed scan (`Checkpoint.through`).
@@ -123,10 +132,10 @@ def export_completion(checkpoint: Checkpoint, path: str | Path, source: Sensor |
     log.info(SLOW)
     module = _Completion(deepcopy(flow.at(flow.space, numbered=False)), source)
     notes = notes_of(checkpoint, flow.sampler, None)
-    notes |= {"source": source.described(), "outputs": {"scan": _SCAN, "completed": _POINTS}}
+    notes |= {"source": source.described(), "outputs": _OUTPUTS}
     with unfused():
         program = traced(module, torch.zeros(1024, 4))
-        model = to_onnx(program, ["points"], ["scan", "completed", "measured"], _AXES)
+        model = to_onnx(program, ["points"], [*_OUTPUTS], _AXES)
     model.metadata_props.add(key="r2flow", value=json.dumps(notes))
     write_file(path, model.SerializeToString())
     write_file(path.with_suffix(".json"), json.dumps(notes))

@@ -27,7 +27,7 @@ _ROOM = 15.0  # metres of reach up to which the camera stands behind a room, fou
 _AXES = np.array([[0, 0.3090, 0.9511], [-1, 0, 0], [0, 0.9511, -0.3090]])
 
 # Ids, names and colours of points by the metres within which they are right in 68 %.
-_LIMITS = (0.05, 0.2, 1.0)
+TRUST_LIMITS = (0.05, 0.2, 1.0)
 TRUST_TITLE = "predicted error (68 %)"
 TRUST = {
     65000: ("measured", "#74c0fc"),
@@ -42,7 +42,7 @@ def trust_ids(image: np.ndarray, error: np.ndarray) -> np.ndarray:
     """The ids of `TRUST` of a scan, (C, H, W), with the 68 % error of each ray in metres, (H, W);
     0 without a return.
     """
-    ids = min(TRUST) + 1 + np.searchsorted(_LIMITS, error)
+    ids = min(TRUST) + 1 + np.searchsorted(TRUST_LIMITS, error)
     return np.where(error > 0, ids, min(TRUST)) * (image[0] > 0)
 
 

@@ -62,7 +62,7 @@ def expected(folder, points):
     import onnxruntime
 
     session = onnxruntime.InferenceSession(folder / "vlp16.onnx")
-    return session.run(["completed", "measured"], {"points": points})
+    return session.run(["completed", "measured", "error_68"], {"points": points})
 
 
 @pytest.mark.parametrize("ending", ["bin", "pcd", "ply", "ascii.pcd", "csv"])
@@ -80,7 +80,7 @@ def test_a_dropped_scan_is_completed_as_in_python(ending, folder, page, tmp_path
         write_points(path, points[:, :3], points[:, 3])
     page.set_input_files("#file", path)
     assert answered(page) == ""
-    completed, measured = expected(folder, points)
+    completed, measured, error = expected(folder, points)
     added = int((~measured).sum())
     said = page.inner_text("#status")
     assert f"{measured.sum():,} measured points in view, {added:,} added" in said
@@ -93,19 +93,24 @@ def test_a_dropped_scan_is_completed_as_in_python(ending, folder, page, tmp_path
     found = read_points(saved)
     np.testing.assert_allclose(found.xyz, completed[:, :3], atol=1e-3)
     np.testing.assert_allclose(found.reflectance, completed[:, 3], atol=1e-3)
+    stored = np.dtype([("point", "<f4", 4), ("error", "<f4"), ("measured", "u1")])
+    rows = np.frombuffer(saved.read_bytes()[-stored.itemsize * len(completed) :], stored)
+    np.testing.assert_array_equal(rows["measured"], measured)
+    np.testing.assert_allclose(rows["error"], error, rtol=0.01, atol=1e-3)
 
 
-def test_the_view_shows_measured_and_added_points(folder, page):
+def test_the_view_shows_measured_and_added_points_by_their_predicted_errors(folder, page):
     page.click("#example")
     assert answered(page) == ""
     frame = page.frames[1]
     frame.wait_for_selector("html[data-ready]", state="attached", timeout=60_000)
     captions = [one.inner_text() for one in frame.query_selector_all("figcaption span")]
     assert captions == ["your scan", "completed"]
-    frame.click("text=origin")
-    assert "measured" in frame.inner_text("#legend")
+    frame.click("text=predicted error")
+    legend = [one.inner_text() for one in frame.query_selector_all("#legend span")]
+    assert legend == ["measured", "added, up to 0.05 m", "up to 0.2 m", "up to 1 m", "more"]
     points = np.fromfile(folder / "example.bin", np.float32).reshape(-1, 4)
-    _, measured = expected(folder, points)
+    _, measured, error = expected(folder, points)
     counts = frame.evaluate(
         """async () => {
           const { scans } = window.view.page;
@@ -114,11 +119,19 @@ def test_the_view_shows_measured_and_added_points(folder, page):
             const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
             const plain = new Uint8Array(await new Response(stream).arrayBuffer());
             const classes = plain.subarray(plain.length - plain.length / 4);
-            return [1, 2].map((kind) => classes.filter((one) => one === kind).length);
+            return [1, 2, 3, 4, 5].map((kind) => classes.filter((one) => one === kind).length);
           }));
         }"""
     )
-    assert counts == [[measured.sum(), (~measured).sum()]] * 2
+    own, completed = counts
+    assert own == completed
+    assert own[0] == measured.sum()
+    bounds = [0, 0.05, 0.2, 1, np.inf]
+    added, _ = np.histogram(error[~measured], bounds)
+    # errors in the browser differ in their last digits
+    slack = [(np.abs(error - bound) < 1e-3).sum() for bound in bounds[1:-1]]
+    assert (np.abs(np.cumsum(own[1:-1]) - np.cumsum(added)[:-1]) <= slack).all()
+    assert sum(own[1:]) == (~measured).sum()
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor, named_sensor
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion_export import export_completion
+from r2flow.reports.pictures import TRUST, TRUST_LIMITS, TRUST_TITLE
 from r2flow.reports.view import STEP, assets, colour_table, described_rays, digest, document
 
 SENSORS = ("vlp16", "vlp32c", "hdl32e")  # with fewer beams than the usual view has rows
@@ -40,7 +41,6 @@ _RUNTIME_FILES = (
 _LICENSE = f"""{_RUNTIME} {_VERSION}, MIT License, Copyright (c) Microsoft Corporation
 https://github.com/microsoft/onnxruntime/blob/main/LICENSE
 """
-_CLASSES = (("measured", "#e5e7eb"), ("added", "#f59e0b"))
 
 
 def write_web(
@@ -95,9 +95,10 @@ def _write_page(folder: Path, models: Sequence[dict[str, Any]]) -> None:
         "frames": [],
         "metres": STEP,
         "colours": colour_table(),
-        "classes": [("no return", "#808080"), *_CLASSES],
-        "legend": _CLASSES,
-        "kind": "origin",
+        "classes": [("no return", "#808080"), *TRUST.values()],
+        "legend": [*TRUST.values()],
+        "limits": TRUST_LIMITS,
+        "kind": TRUST_TITLE,
     }
     write_file(folder / "models.json", json.dumps({"models": models, "view": view}))
 

@@ -58,7 +58,7 @@ function quantiles(values, ...q) {
 const rounded = (values) => values.map((value) => Math.round(10 * value) / 10);
 
 /** What the page of `r2flow view` draws: the scan as it was measured, and completed. */
-async function contents({ model, scan, points, measured }) {
+async function contents({ model, scan, points, measured, errors }) {
   const { rays } = about.models.find((one) => one.name === model);
   const pixels = rays.rows * rays.columns;
   const range = scan.subarray(0, pixels);
@@ -67,11 +67,12 @@ async function contents({ model, scan, points, measured }) {
   const turn = 2 * Math.PI;
   const order = rays.azimuths.map((angle, column) => [((angle % turn) + turn) % turn, column]).sort((a, b) => a[0] - b[0]);
   const classes = new Uint8Array(pixels);
+  const kind = (own, error) => (own ? 1 : 2 + about.view.limits.filter((limit) => limit < error).length);
   let next = 0;
   for (let row = 0; row < rays.rows; row++) {
     for (const [, column] of order) {
       const pixel = row * rays.columns + column;
-      if (range[pixel] > 0) classes[pixel] = measured[next++] ? 1 : 2;
+      if (range[pixel] > 0) classes[pixel] = kind(measured[next], errors[next++]);
     }
   }
   const own = range.map((r, i) => (classes[i] === 1 ? r : 0));
@@ -115,7 +116,7 @@ async function packed(range, reflectance, classes, metres, columns) {
 
 function save(format) {
   const link = document.createElement("a");
-  link.href = URL.createObjectURL(write(format, result.points, result.measured));
+  link.href = URL.createObjectURL(write(format, result.points, result.measured, result.errors));
   link.download = `${result.name.replace(/\.[^.]+$/, "")}-completed.${format}`;
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);

@@ -159,19 +159,19 @@ function readCsv(bytes) {
   return written(lines, first.split(separator).map((name) => name.trim().replaceAll('"', "")), separator);
 }
 
-/** A .pcd or .ply of completed points, rows of x, y, z, intensity, and their `measured`. */
-export function write(format, points, measured) {
+/** A .pcd or .ply of completed points, rows of x, y, z, intensity, with their predicted errors and `measured`. */
+export function write(format, points, measured, errors) {
   const count = measured.length;
-  const bytes = new Uint8Array(17 * count);
-  const values = new Uint8Array(points.buffer, points.byteOffset, points.byteLength);
+  const view = new DataView(new ArrayBuffer(21 * count));
   for (let i = 0; i < count; i++) {
-    bytes.set(values.subarray(16 * i, 16 * i + 16), 17 * i);
-    bytes[17 * i + 16] = measured[i];
+    for (let j = 0; j < 4; j++) view.setFloat32(21 * i + 4 * j, points[4 * i + j], true);
+    view.setFloat32(21 * i + 16, errors[i], true);
+    view.setUint8(21 * i + 20, measured[i]);
   }
   const head = format === "ply"
     ? `ply\nformat binary_little_endian 1.0\nelement vertex ${count}\nproperty float x\nproperty float y\n`
-      + "property float z\nproperty float intensity\nproperty uchar measured\nend_header\n"
-    : "VERSION 0.7\nFIELDS x y z intensity measured\nSIZE 4 4 4 4 1\nTYPE F F F F U\nCOUNT 1 1 1 1 1\n"
+      + "property float z\nproperty float intensity\nproperty float error_68\nproperty uchar measured\nend_header\n"
+    : "VERSION 0.7\nFIELDS x y z intensity error_68 measured\nSIZE 4 4 4 4 4 1\nTYPE F F F F F U\nCOUNT 1 1 1 1 1 1\n"
       + `WIDTH ${count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS ${count}\nDATA binary\n`;
-  return new Blob([head, bytes], { type: "application/octet-stream" });
+  return new Blob([head, view], { type: "application/octet-stream" });
 }

@@ -68,12 +68,12 @@ async function complete({ file, sensor, models }) {
   const session = await load(model);
   say(`completing ${count.toLocaleString()} points of ${model.name} ...`);
   const begin = performance.now();
-  const { scan, completed, measured } = await session.run({ points: new ort.Tensor("float32", points, [count, 4]) });
+  const { scan, completed, measured, error_68: errors } = await session.run({ points: new ort.Tensor("float32", points, [count, 4]) });
   const seconds = (performance.now() - begin) / 1000;
   if (!completed.dims[0]) throw new Refusal(`No point lies in the view of ${model.name}. Choose another sensor above.`);
   const answer = completed.data;
   for (let i = 3; i < answer.length; i += 4) answer[i] *= full;
-  return { model: model.name, count, unused, seconds, scan: scan.data, points: answer, measured: measured.data };
+  return { model: model.name, count, unused, seconds, scan: scan.data, points: answer, measured: measured.data, errors: errors.data };
 }
 
 onmessage = async ({ data }) => {
