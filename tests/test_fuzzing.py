@@ -66,7 +66,7 @@ def write_scans(folder: Path) -> None:
         import laspy
 
         cloud = laspy.LasData(laspy.LasHeader(version="1.4", point_format=6))
-        cloud.x, cloud.y, cloud.z, cloud.intensity = *XYZ.T.astype(np.float64), np.arange(64)
+        cloud.x, cloud.y, cloud.z, cloud.intensity = *XYZ.T.astype(np.float64), np.arange(len(XYZ))
         cloud.write(folder / "a.las")
 
 
@@ -92,7 +92,9 @@ def write_stores(folder: Path, beside: Path) -> None:
     keep(folder, "pairs", *(file for file in (beside / "pairs").iterdir() if file.is_file()))
     write_points(beside / "scan.bin", XYZ, REFLECTANCE)
     (folder / "labels").mkdir()
-    DRAW.choice([0, 10, 40, 50, 70, 252], 64).astype("<u4").tofile(folder / "labels" / "scan.label")
+    DRAW.choice([0, 10, 40, 50, 70, 252], len(XYZ)).astype("<u4").tofile(
+        folder / "labels" / "scan.label"
+    )
     (folder / "image").mkdir()
     np.save(folder / "image" / "image.npy", DRAW.uniform(2, 70, (2, 8, 64)).astype(np.float32))
     Store(beside / "samples", "samples", {"reading": Reading(SENSOR).described()}).begin()

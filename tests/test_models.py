@@ -103,7 +103,7 @@ def test_sample_without_a_checkpoint_draws_from_the_default_model(r2flow, tmp_pa
     monkeypatch.chdir(tmp_path)
     said = r2flow("sample", "--num", 1, "--steps", 1, "--pictures", 0, "--out", "scans").said
     assert said.startswith("the model street: ")
-    r2flow("sample", "-c", "street", "--num", 1, "--steps", 1, "--pictures", 0, "--out", "named")
+    r2flow("sample", "street", "--num", 1, "--steps", 1, "--pictures", 0, "--out", "named")
     assert Path("scans/000000.ply").read_bytes() == Path("named/000000.ply").read_bytes()
 
 

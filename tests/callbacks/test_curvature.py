@@ -45,7 +45,7 @@ class Stage(L.LightningModule):
         super().__init__()
         self.velocity = Shrinking(0.0)
         self.generator = Field(self.velocity, SPACE.shape, SPACE)
-        self.save_hyperparameters({"seed": 7})
+        self.seed = 7
         self.draws = []
 
     def training_step(self, batch, batch_idx):

@@ -59,7 +59,7 @@ def save_recorded(self, checkpoint, path, storage_options=None) -> None:
 
 def item_broken(self, key):
     found = item(self, key)
-    if key[0] in BROKEN and self.purpose == "training":
+    if self.purpose == "training" and key[0] in BROKEN:
         found["x_1"] = torch.full_like(found["x_1"], float("nan"))
     return found
 
