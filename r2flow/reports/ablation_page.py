@@ -10,7 +10,7 @@ from statistics import fmean, stdev
 from matplotlib.figure import Figure
 
 from r2flow.metrics.things import LINES
-from r2flow.reports.figures import Plot, lines_figure
+from r2flow.reports.figures import Plot, lines_figure, plain_ticks
 from r2flow.reports.pages import Page
 from r2flow.reports.tables import Part, Row, Table
 
@@ -149,6 +149,7 @@ def _figure(systems: _Systems, references: Sequence[Row]) -> Figure:
     figure = lines_figure(plots, 2)
     for panel, x in zip(figure.axes, axes.values(), strict=True):
         panel.set_yscale("log")
+        plain_ticks(panel.yaxis)
         for line, rows in zip([*panel.lines], systems.values(), strict=True):
             style: Row = {
                 "fmt": line.get_marker(),

@@ -9,9 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import rc_context
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from matplotlib.ticker import LogLocator, StrMethodFormatter
 
 from r2flow.base.errors import printable
 from r2flow.base.files import atomic_write
@@ -62,12 +64,22 @@ def lines_figure(plots: Sequence[Plot], columns: int) -> Figure:
         values = [v for _, y in plot.lines.values() for v in np.ravel(y) if math.isfinite(v)]
         if values and 0 < 3 * min(values) < max(values):  # else its labels would be 1.11 x 10^0
             axes.set_yscale("log")
+        for axis in (axes.xaxis, axes.yaxis):
+            if axis.get_scale() == "log":
+                plain_ticks(axis)
         axes.grid(color="0.88", lw=0.6)
         axes.tick_params(which="both", labelsize=8)
     if legend:
         handles = {line.get_label(): line for axes in figure.axes for line in axes.lines}
         figure.legend(handles=handles.values(), fontsize=8, loc="outside lower left", frameon=False)
     return figure
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Label a logarithmic axis by 0.1, 0.3, 1, ..., which stay apart."""
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_locator(LogLocator(subs=(3,)))
+    axis.set_minor_formatter(StrMethodFormatter("{x:g}"))
 
 
 def save_figure(
