@@ -9,7 +9,6 @@ import torch
 from r2flow.base.errors import InputError
 from r2flow.flow.path import expand_time
 from r2flow.flow.solvers import SOLVERS, EmbeddedMethod, FixedStep, named_grid, solve
-from r2flow.flow.solvers.defect import interpolant
 from r2flow.samplers import build_sampler
 from tests.fields import Field
 from tests.reference import assert_near, backbone_of, load_case
@@ -51,7 +50,7 @@ def test_an_adaptive_method_of_equal_steps_has_its_order(method):
     nodes, theta = np.array([0.0, *SOLVERS[method].nodes]), np.linspace(0, 1, 9)
     exact = [[theta ** (q + 1) / (q + 1), theta**q] for q in range(4)]
     found = [
-        [weights.T @ nodes**q for weights in interpolant(SOLVERS[method], theta)] for q in range(4)
+        [weights.T @ nodes**q for weights in SOLVERS[method].interpolant(theta)] for q in range(4)
     ]
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-12)
 

@@ -97,8 +97,8 @@ def solve(
         progress: Called after every evaluation.
         grid: Time grid of fixed steps: `uniform`, `power:P` (t = 1 - (1 - u)^P), or (N + 1,) times.
         max_evaluations: Budget of a scene in an adaptive method, for each solution.
-        max_step: Longest step of r2flow's adaptive methods as a share of the interval. dopri5 sees
-            pulses of v in time of 0.16 of the interval or more; with 1/64 those of 1/128.
+        max_step: Longest step of r2flow's adaptive methods as a share of the interval. dopri5 finds
+            jumps of v in time, and pulses of 0.16 of the interval; with 1/64 those of 1/128.
         global_error: Estimate an adaptive method's error at t_1, by a second, tighter solution.
     """
     solver = method_of(method)

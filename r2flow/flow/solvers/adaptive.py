@@ -13,7 +13,7 @@ from torch import Tensor
 
 from r2flow.flow.path import expand_time
 from r2flow.flow.solvers.batched import norms, powered, unpowered, weighted
-from r2flow.flow.solvers.defect import missed
+from r2flow.flow.solvers.defect import Tried, inspect
 from r2flow.flow.solvers.embedded import EmbeddedMethod
 from r2flow.flow.solvers.solution import Evaluations, Limits
 from r2flow.flow.solvers.step_size import StepController
@@ -88,8 +88,7 @@ def _step(
     size = size / tolerance
     error = unpowered(powers)
     good = control.within(error, dk, dy, size)
-    control.shorten = missed(control, x, torch.stack(k), h, scale, good) | ~(dy <= size)
-    good &= ~control.shorten
+    good = inspect(control, Tried(method, x, k, h, scale), good)
     control.note_poles(good, speed, size, together < apart)
     control.judge(good, error, dk, dy)
     accepted = expand_time(torch.from_numpy(good).to(x.device), x)

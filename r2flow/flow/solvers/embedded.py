@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 from torch import Tensor
 
 from r2flow.flow.solvers.solution import Evaluations, Solution
@@ -26,6 +27,10 @@ class EmbeddedMethod:
     # |h lambda| of stiff steps: near the end of the stability region on the negative real axis.
     stability: float
     bump: tuple[float, ...]  # d_i, the weights of the quartic term of the interpolant
+    # Stages of the third divided difference, the roughness of v along a step.
+    rough: tuple[int, int, int, int]
+    # Largest of a step in tolerances: several times that of accurate steps of the exact problems.
+    defect: float
 
     @np.errstate(all="ignore")
     def solve(self, v: Evaluations, x: Tensor, times: Tensor) -> Solution:
@@ -34,6 +39,37 @@ class EmbeddedMethod:
 
         t_0, t_1 = times.tolist()
         return v.solution(advance(v, x, t_0, t_1, self))
+
+    @property
+    def distinct(self) -> dict[float, int]:
+        """The stage at each time of the step, the last one of several, in increasing time."""
+        return dict(sorted({c: i for i, c in enumerate((0.0, *self.nodes))}.items()))
+
+    @property
+    def third_difference(self) -> list[float]:
+        """Weights of the stages that annihilate quadratic functions of t; the largest is 1."""
+        times = np.array((0.0, *self.nodes))
+        weights = np.zeros_like(times)
+        stages = list(self.rough)
+        weights[stages] = np.linalg.inv(np.vander(times[stages], increasing=True))[-1]
+        return (weights / np.abs(weights).max()).tolist()
+
+    def interpolant(self, theta: ndarray) -> ndarray:
+        """w_i and dw_i / dtheta of x + h sum_i w_i(theta) k_i, (2, stages + 1, B).
+
+        Cubic Hermite interpolant plus a quartic bump, continuously differentiable: Hairer, Norsett,
+        Wanner, Solving Ordinary Differential Equations I, II.6.
+        """
+        b = np.array([*self.rows[-1], 0.0])[:, None]
+        d = np.array(self.bump)[:, None]
+        rest = 1 - theta
+        state = b * (theta**2 * (3 - 2 * theta)) + d * (theta * rest) ** 2
+        state[0] += theta * rest**2
+        state[-1] -= theta**2 * rest
+        slope = b * (6 * theta * rest) + d * (2 * theta * rest * (1 - 2 * theta))
+        slope[0] += rest * (1 - 3 * theta)
+        slope[-1] -= theta * (2 - 3 * theta)
+        return np.stack([state, slope])
 
 
 # Dormand, Prince, A family of embedded Runge-Kutta formulae, 1980.
@@ -61,4 +97,6 @@ dopri5 = EmbeddedMethod(
         -1453857185 / 822651844,
         69997945 / 29380423,
     ),
+    rough=(0, 2, 3, 6),
+    defect=60.0,
 )
