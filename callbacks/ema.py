@@ -27,7 +27,7 @@ class EMA(WeightAveraging):
 
     Args:
         decay: Highest decay.
-        rule: Decay schedule, a name in `_DECAYS`; `ratio` and `constant` are meant for every=1.
+        rule: Decay schedule, `power`, `constant` or `ratio`; the last two are meant for every=1.
         every: Steps between two updates.
         warmup_steps: Steps during which the average copies the weights; None: the stage's
             learning-rate warm-up.

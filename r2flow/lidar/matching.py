@@ -19,9 +19,8 @@ from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.lidar.unfolding import elevations_of
 
 _FEWEST_RETURNS = 1000  # for a judgement
-_IN_VIEW = (
-    0.9  # minimum share of returns in the sensor's view; tested real scans have 0.967 or more
-)
+# Minimum share of returns in the sensor's view; tested real scans have 0.967 or more.
+_IN_VIEW = 0.9
 _OFF = 1.5  # degrees, by `_distance`: beams at a larger distance are of another sensor
 # Share of rows between the beams: KITTI's scans have 0.02 at most, an OS1's .34 degrees off 0.16.
 _MOST_VOID = 0.1
