@@ -83,11 +83,15 @@ def open_recording(path: Path) -> Iterator[Recording]:
     Raises:
         InputError: It is missing, damaged or of another format.
     """
+    with reading_errors(path):
+        paths = _files(path)
+        for file in filter(Path.is_file, paths):
+            refuse_pointer(file)
     require(str(path), "formats", "rosbags")
     # rosbags, mcap and the stores below them raise many kinds on damaged files
     with ExitStack() as stack:
         with reading_errors(path):
-            files = [stack.enter_context(_open(file)) for file in _files(path)]
+            files = [stack.enter_context(_open(file)) for file in paths]
 
         def messages(topic: str | None) -> Iterator[Message]:
             with reading_errors(path):
@@ -148,8 +152,6 @@ def _files(path: Path) -> list[Path]:
 
 
 def _open(path: Path) -> AbstractContextManager[Recording]:
-    if path.is_file():
-        refuse_pointer(path)
     if path.suffix.lower() == ".mcap":
         from r2flow.lidar.mcap_files import open_mcap  # needs this module
 
