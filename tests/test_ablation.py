@@ -2,6 +2,7 @@
 
 import csv
 import shutil
+from operator import itemgetter
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,6 +14,7 @@ from r2flow.base.errors import InputError
 from r2flow.reports.ablation import TIMES, Judge, _squared_errors
 from r2flow.reports.ablation_page import compared, frontier, over_seeds, verdict
 from r2flow.reports.tables import Row
+from r2flow.runs.ablate import _steps_of
 from r2flow.runs.ablation import Ablation, Clock
 from r2flow.runs.composing import compose
 
@@ -37,6 +39,29 @@ def test_every_combination_is_trained_and_named_by_its_swept_values():
     assert found.swept == "backbone.patch, stage"
     assert found.seconds == 60 / 8
     assert len({link.config.run_dir for (link,) in found.runs.values()}) == 8
+
+
+def test_a_key_that_only_some_backbones_have_is_swept_for_those():
+    found = ablation("backbone=hdit_tiny,adm_unet_tiny", "backbone.patch=[1,4],[2,4]")
+    assert found.variants == {
+        "hdit_tiny, [1,4]": ["backbone=hdit_tiny", "backbone.patch=[1,4]"],
+        "hdit_tiny, [2,4]": ["backbone=hdit_tiny", "backbone.patch=[2,4]"],
+        "adm_unet_tiny": ["backbone=adm_unet_tiny"],
+    }
+    misspelled = ablation("backbone=hdit_tiny,adm_unet_tiny", "backbone.patches=[1,4],[2,4]")
+    assert len(misspelled.variants) == 4
+    with pytest.raises(InputError, match="patches"):
+        misspelled.check()
+
+
+def test_the_last_link_s_row_gives_the_steps_of_all():
+    rows = [
+        {"combination": "r2flow", "steps": "30"},
+        {"combination": "r2flow", "steps": "30+20+4"},
+        {"combination": "r2flow", "steps": "30+20"},
+        {"combination": "before this column"},
+    ]
+    assert _steps_of(rows) == {"r2flow": [30, 20, 4]}
 
 
 @pytest.mark.parametrize(
@@ -135,7 +160,11 @@ def test_an_ablation_ends_with_a_table_and_resumes(tmp_path, r2flow, quick_pictu
     table = tmp_path / "out" / "ablation.csv"
     rows = list(csv.DictReader(table.open()))
     runs = [row for row in rows if float(row["budget"]) > 0]
-    assert [row["combination"] for row in runs] == ["velocity", "data"]
+    assert [(row["combination"], row["sampler"]) for row in runs] == [
+        (prediction, sampler)
+        for prediction in ("velocity", "data")
+        for sampler in ("euler", "adams3")
+    ]
     assert rows[0]["combination"] == "training scans"
     for row in runs:
         assert float(row["error of x_1, t = 0.5"]) > 0
@@ -148,6 +177,16 @@ def test_an_ablation_ends_with_a_table_and_resumes(tmp_path, r2flow, quick_pictu
     assert "[1/2]" not in again.said
     assert "velocity at equal seconds a scan" in again.said
     assert list(csv.DictReader(moved.open())) == rows
+    # its steps repeat its runs, here two at once
+    repeated = tmp_path / "repeated.csv"
+    done = r2flow(*command, "1s", "--rows", repeated, "--steps", moved, "--workers", "2")
+    assert "2 of 2 runs" in done.said
+    again = [row for row in csv.DictReader(repeated.open()) if float(row["budget"]) > 0]
+    again.sort(key=lambda row: [*map(itemgetter("combination"), runs)].index(row["combination"]))
+    for row, first in zip(again, runs, strict=True):
+        assert (row["combination"], row["steps"]) == (first["combination"], first["steps"])
+        for column in ("distance", "jsd", "error of x_1, t = 0.5"):
+            assert float(row[column]) == pytest.approx(float(first[column]), rel=1e-3)
 
 
 def test_systems_end_with_a_table_and_a_figure(tmp_path, r2flow, quick_pictures):

@@ -1,4 +1,4 @@
-"""Processes that make the items of a store."""
+"""Processes that make the items of a store, or of another object with `attempt` and `folder`."""
 
 import logging
 import multiprocessing
@@ -16,13 +16,13 @@ from typing import Any
 from r2flow.base.errors import InputError
 from r2flow.base.signals import blocking_signals, code_of, end_with_parent
 
-_Work = Callable[[int], None]
+_Work = Callable[[int], Any]
 
 
 def attempts_of(
     store: Any, items: list[int], work: _Work, workers: int
-) -> Generator[tuple[int, bool]]:
-    """`Store.attempt` of each item in `workers` processes (1: this one): items and results, as they
+) -> Generator[tuple[int, Any]]:
+    """`store.attempt` of each item in `workers` processes (1: this one): items and results, as they
     come.
 
     Not by `concurrent.futures`, whose queues hold semaphores: a signal to the group of processes
@@ -100,13 +100,13 @@ def _serve(end: Connection) -> None:
         if first and working:  # elsewhere an exception leaves a lock, or ends in `FileLock.__del__`
             raise SystemExit(code_of(number))
 
-    def interruptible(item: int) -> None:
+    def interruptible(item: int) -> Any:
         nonlocal working
         working = True
         try:
             if stopped:
                 raise SystemExit(code_of(signal.SIGTERM))
-            work(item)
+            return work(item)
         finally:
             working = False
 

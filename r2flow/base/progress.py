@@ -35,6 +35,8 @@ class Bar(Progress):
         every: Seconds between lines.
     """
 
+    label = ""  # before each line, of a process beside others; it draws no bar
+
     def __init__(
         self,
         doing: str,
@@ -45,6 +47,7 @@ class Bar(Progress):
         evaluations: int = 0,
         every: float = 30,
     ) -> None:
+        lines = lines or (bool(self.label) and shown is None)
         drawn = not lines and (
             sys.stderr is not None and sys.stderr.isatty() if shown is None else shown
         )
@@ -79,7 +82,7 @@ class Bar(Progress):
             # not those begun
             counted = f"{self._doing} {int(task.completed + 1e-6)}/{task.total:.0f} {self._unit}"
             left = _duration(task.time_remaining or 0)
-            line = f"{counted}  {task.speed:.2f}/s  {left} left  {task.fields['note']}"
+            line = f"{self.label}{counted}  {task.speed:.2f}/s  {left} left  {task.fields['note']}"
             print(line.rstrip(), file=sys.stderr, flush=True)
 
     def evaluated(self) -> None:

@@ -61,6 +61,13 @@ def ablate(
         Path | None,
         Option(help="CSV of the finished runs, of any budget. Default: OUT/ablation.csv."),
     ] = None,
+    steps: Annotated[
+        Path | None,
+        Option(help="CSV whose runs give the training steps, to repeat them in another --rows."),
+    ] = None,
+    workers: Annotated[
+        int, Option(min=1, help="Runs at once on a processor, each with one thread if several.")
+    ] = 1,
     out: OutOption = Path("runs/ablation"),
     device: DeviceOption = "auto",
 ) -> int:
@@ -82,7 +89,17 @@ def ablate(
     check_folder(out)
     csv = rows or out / "ablation.csv"
     ablation = Ablation(keys, seeds, budget, out)
-    page = train_and_measure(ablation, csv, real, num, evaluations, where)
+    page = train_and_measure(
+        ablation,
+        csv,
+        real,
+        num,
+        evaluations,
+        where,
+        workers,
+        steps,
+        follow=lambda page: write_page(page, out),
+    )
     if page is None:
         return LATER
     print_text(page.text)

@@ -37,7 +37,7 @@ _BATCH = 8
 _PATHS = 8  # scans of the bend
 _METRICS = ("things", "jsd", "mmd", "kid_handcrafted_range", "frechet_handcrafted_range")
 _WORK = Work(_BATCH)
-_TEXTS = ("combination", "model", "sampler", "settings")  # columns that are no numbers
+_TEXTS = ("combination", "model", "sampler", "settings", "steps")  # columns that are no numbers
 # Samplers and numbers of steps by a generator's default sampler; of others it is the only one.
 _SYSTEMS: Mapping[str, Mapping[str, Sequence[int]]] = {
     "adams3": {"euler": (1, 2, 4, 8, 16), "adams3": (2, 4, 8, 16)},
@@ -86,7 +86,8 @@ def _of_range(lines: Mapping[str, float]) -> float:
 
 
 def measure_run(run: str, judge: Judge, evaluations: Sequence[int] | None) -> list[Row]:
-    """Figures of a run by its samplers: its default one in `evaluations`, else those of `_SYSTEMS`.
+    """Figures of a run by its samplers: those of `_SYSTEMS`, or the default one and, of flows,
+    Euler in `evaluations`.
 
     Every run has the same held-out scans and the same noise.
     """
@@ -112,7 +113,8 @@ def measure_run(run: str, judge: Judge, evaluations: Sequence[int] | None) -> li
 
 def _samplers(generator: Generator, evaluations: Sequence[int] | None) -> list[Sampler]:
     default = generator.sampler
-    counts = {default.name: evaluations} if evaluations else _SYSTEMS.get(default.name, {})
+    names = ["euler", default.name] if isinstance(generator, Flow) else [default.name]
+    counts = dict.fromkeys(names, evaluations) if evaluations else _SYSTEMS.get(default.name, {})
     if generator.fixed:
         kept = not evaluations or default.evaluations(generator) in evaluations
         return [default] if kept else []

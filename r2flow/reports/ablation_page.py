@@ -103,7 +103,7 @@ def ablation_page(
     rows: Sequence[Row], names: Sequence[str], budget: float, about: str, device: str
 ) -> Page:
     """Build the page of the stored rows of these combinations; the table and the figure are of one
-    budget.
+    budget, of which there is at least one row.
 
     The training scans are the table's first row, the best baseline is its last one.
     """
@@ -112,8 +112,9 @@ def ablation_page(
     systems: dict[str, list[Row]] = {}
     learned: dict[str, Row] = {}
     for name in names:
-        runs = [row for row in rows if row["combination"] == name]
-        systems[name] = over_seeds(row for row in runs if row["budget"] == budget)
+        runs = [row for row in rows if row["combination"] == name and row["budget"]]
+        if measured := over_seeds(row for row in runs if row["budget"] == budget):
+            systems[name] = measured
         learned[name] = {"combination": name}
         for seconds in sorted({row["budget"] for row in runs}):
             distances = [row[_DISTANCE] for row in runs if row["budget"] == seconds]

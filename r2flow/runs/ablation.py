@@ -1,21 +1,24 @@
 """Ablations: every combination of swept config keys, trained for equal seconds with several seeds.
 
 The seconds of a training step are measured once for each combination, which gives its number of
-steps. A run of as many steps resumes bit for bit and ends with a learning rate of 0, which a run
-stopped by the clock would not. A combination that is a chain, as experiment=r2flow, shares its
-seconds between its links, in proportion to their trainer.max_steps; its pairs are part of them.
+steps; finished runs give theirs. A run of as many steps resumes bit for bit and ends with a
+learning rate of 0, which a run stopped by the clock would not. A combination that is a chain, as
+experiment=r2flow, shares its seconds between its links, in proportion to their trainer.max_steps;
+its pairs are part of them.
 """
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from itertools import compress, product
+from functools import cache, cached_property
+from itertools import product
 from pathlib import Path
 from statistics import median
+from typing import Any, NamedTuple
 
 import torch
+from filelock import FileLock
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
@@ -86,6 +89,22 @@ class Clock(ReflowPairs):
         self.images += len(batch["x_1"])
 
 
+class Cost(NamedTuple):
+    """Cost of a training."""
+
+    seconds: float
+    images: int
+    steps: int
+
+
+def _has(config: Any, names: Sequence[str]) -> bool:
+    """Whether a config has a key; groups without a value have any."""
+    if not names or config is None:
+        return True
+    name, *others = names
+    return isinstance(config, Mapping) and name in config and _has(config[name], others)
+
+
 def _now(device: torch.device) -> float:
     if device.type == "cpu":
         return time.process_time() / torch.get_num_threads()
@@ -102,12 +121,14 @@ class Ablation:
         seeds: Number of seeds.
         budget: Seconds of training of all runs together; unused if `keys` set trainer.max_steps.
         out: Folder of the plan and the runs.
+        steps: Steps of the links of combinations, which are then not measured.
     """
 
     keys: Sequence[str]
     seeds: int
     budget: float
     out: Path
+    steps: Mapping[str, Sequence[int]] = field(default_factory=dict)
     _data: ScanDataModule | None = field(default=None, init=False)
 
     @cached_property
@@ -124,7 +145,9 @@ class Ablation:
 
     @cached_property
     def variants(self) -> dict[str, list[str]]:
-        """Overrides of each combination, by its swept values."""
+        """Overrides of each combination, by its swept values. A swept key that only some choices of
+        a group have, as backbone.patch, is left out for the others.
+        """
         choices = []
         for one in self._parsed:
             values = [str(one.input_line)]
@@ -132,13 +155,30 @@ class Ablation:
                 key = one.get_key_element()
                 values = [f"{key}={value}" for value in one.sweep_string_iterator()]
             choices.append(values)
-        swept = [one.is_sweep_override() for one in self._parsed]
-        return {
-            ", ".join(text.partition("=")[2] for text in compress(overrides, swept)): list(
-                overrides
-            )
-            for overrides in product(*choices)
-        }
+        combinations = [*product(*choices)]
+        config_of = cache(lambda *texts: compose(texts))
+        lacking = {overrides: self._lacking(overrides, config_of) for overrides in combinations}
+        of_none = set.intersection(*map(set, lacking.values()))  # misspelled: Hydra refuses them
+        found: dict[str, list[str]] = {}
+        for overrides in combinations:
+            left_out = {*lacking[overrides]} - of_none
+            pairs = zip(self._parsed, overrides, strict=True)
+            kept = [(one, text) for one, text in pairs if one.key_or_group not in left_out]
+            values = [text.partition("=")[2] for one, text in kept if one.is_sweep_override()]
+            found[", ".join(values)] = [text for _, text in kept]
+        return found
+
+    def _lacking(
+        self, overrides: Sequence[str], config_of: Callable[..., Mapping[str, Any]]
+    ) -> list[str]:
+        """The swept keys that the config of a combination's choices does not have."""
+        pairs = [*zip(self._parsed, overrides, strict=True)]
+        keys = [one.key_or_group for one in self._parsed if one.is_sweep_override()]
+        keys = [key for key in keys if "." in key]
+        if not keys:
+            return []
+        config = config_of(*(text for one, text in pairs if "." not in one.key_or_group))
+        return [key for key in keys if not _has(config, key.split("."))]
 
     @property
     def swept(self) -> str:
@@ -243,12 +283,16 @@ class Ablation:
 
     def _steps(self, seed: int, name: str, number: int, seconds: float) -> int:
         """Steps of a link in as many seconds; as measured before by the plan."""
+        if number < len(self.steps.get(name, ())):
+            return self.steps[name][number]
         path = self.out / f"{self.seconds:g}s" / _PLAN
-        plan = read_json(path) if path.is_file() else {}
+        path.parent.mkdir(parents=True, exist_ok=True)
         place = ", ".join([name, *self.runs[seed, name][number].name.split()])
-        if place not in plan:
-            plan[place] = self._measured_steps(seed, name, number, seconds)
-            write_file(path, json.dumps(plan, indent=1))
+        with FileLock(path.with_suffix(".lock")):  # other workers wait for the measurement
+            plan = read_json(path) if path.is_file() else {}
+            if place not in plan:
+                plan[place] = self._measured_steps(seed, name, number, seconds)
+                write_file(path, json.dumps(plan, indent=1))
         return plan[place]
 
     def _measured_steps(self, seed: int, name: str, number: int, seconds: float) -> int:
@@ -274,7 +318,8 @@ class Ablation:
         return steps
 
 
-def training_cost(run: str) -> dict[str, float]:
-    """Seconds and images of a run's training, by its last checkpoint."""
-    clock = read_checkpoint(find_checkpoint(run))["callbacks"]["Clock"]
-    return {"seconds of training": clock["seconds"], "images": clock["images"]}
+def training_cost(link: Link) -> Cost:
+    """Cost of a finished link's training, by its last checkpoint."""
+    clock = read_checkpoint(find_checkpoint(link.config.run_dir))["callbacks"]["Clock"]
+    steps = clock["images"] // link.config.data.batch_size
+    return Cost(clock["seconds"], clock["images"], steps)
