@@ -12,10 +12,10 @@ from r2flow.lidar.other_sensors import Partial
 from r2flow.lidar.projection import image_points
 from r2flow.lidar.scan_files import Cloud
 from r2flow.lidar.scan_files.cloud import as_type
+from r2flow.lidar.scan_files.points import OWN
 from r2flow.lidar.sensors import Sensor
 
 _MEASURED = "measured"  # uint8: 1 for a point of the scan, 0 for an added one
-_TRUST = ("error_68", "error_95", "p_return")  # float32, see `Completed.trust`
 # Values of fields that added points lack, by the kind of their dtype; 0 of others.
 _EMPTY = {"f": np.nan, "c": np.nan, "M": "NaT", "m": "NaT", "O": None}
 ROW = "image_row"  # uint16: row of the answer's sensor from the top, of every point
@@ -103,9 +103,7 @@ def unknown_fields(cloud: Cloud) -> list[str]:
     """The fields of a scan that added points cannot have: they are NaN or 0 there."""
     known = {cloud.place(role) for role in ("x", "y", "z", "reflectance", "ring", "time")}
     return [
-        name
-        for place, name in enumerate(cloud.names)
-        if place not in known and name not in (_MEASURED, ROW, *_TRUST)
+        name for place, name in enumerate(cloud.names) if place not in known and name not in OWN
     ]
 
 

@@ -116,6 +116,17 @@ def test_a_field_that_may_be_the_reflectance_is_named_and_renamed(tmp_path, capl
     assert not caplog.records
 
 
+@pytest.mark.parametrize("other", ["", "gain"])
+def test_fields_that_a_completion_wrote_are_not_offered_as_reflectance(tmp_path, caplog, other):
+    names = ["x", "y", "z", "measured", "image_row", "error_68", "error_95", "p_return"]
+    header = ",".join([*names, *filter(None, [other])])
+    table = np.column_stack([XYZ, np.ones((500, header.count(",") - 2))])
+    np.savetxt(tmp_path / "a.csv", table, "%.6g", ",", header=header, comments="")
+    same(read_points(tmp_path / "a.csv"), intensity=None)
+    assert ("not used: gain." in caplog.text) == bool(other)
+    assert bool(caplog.records) == bool(other)
+
+
 def test_a_rename_precedes_the_usual_names(tmp_path):
     path = tmp_path / "a.npy"
     names = ("x", "y", "z", "intensity", "strength", "ring", "beam")

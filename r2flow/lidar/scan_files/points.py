@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 # or width are beyond these limits, because their exponent changes.
 FARTHEST = 1e4
 NEAREST = 1e-3
+# r2flow's own fields, of a completed cloud (`r2flow.lidar.added`), are what their names say.
+OWN = ("measured", "image_row", "error_68", "error_95", "p_return")
 # The first name in the file is used: Ouster writes both an intensity and a calibrated reflectivity.
 _ROLES: Mapping[str, tuple[str, ...]] = {
     "x": ("x", "points_m_xyz:0", "points:0", "x1"),  # VeloView's, and Ouster's first return
@@ -31,7 +33,7 @@ _ROLES: Mapping[str, tuple[str, ...]] = {
         "t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset",
         "offset_ns", "gps_time", "point_time_offset",
     ),
-    "measured": ("measured",),  # r2flow's: 0 for a point that a completion added
+    **{name: (name,) for name in OWN},
 }  # fmt: skip
 _ONCE = ("x", "y", "z", "reflectance", "ring")  # a file's columns name each at most once
 # What no reflectance is called: colours, normals, times, labels, angles, distances and flags.
