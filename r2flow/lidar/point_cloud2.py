@@ -70,12 +70,22 @@ def read_message(path: Path, message: "Message") -> Scan | InputError:
 
 
 def written(cloud: Cloud, stamp: int, frame: str, encoding: str) -> bytes:
-    """A message of a cloud, as `Scan.replaced` of one without fields."""
+    """A message of a cloud, as `Scan.replaced` of one without fields.
+
+    Raises:
+        InputError: ROS cannot count the time.
+    """
     types = type_store(encoding).types
     seconds, nanoseconds = divmod(stamp, 10**9)
+    if encoding == "ros1":
+        check(
+            0 <= seconds < 2**32,
+            f"the time {stamp} ns is not one of ROS 1, which counts from 1970 to 2106.",
+        )
+        seconds -= 2**32 * (seconds >= 2**31)  # rosbags writes them signed
     check(
         -(2**31) <= seconds < 2**31,
-        f"the time {stamp} ns is not one of ROS 2, which ends in 2038.",
+        f"the time {stamp} ns is not one of ROS 2, which counts from 1901 to 2038.",
     )
     time = types["builtin_interfaces/msg/Time"](seconds, nanoseconds)
     sequence = (0,) if encoding == "ros1" else ()

@@ -3,6 +3,8 @@ as bytes.
 """
 
 import re
+import struct
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -84,6 +86,27 @@ def test_every_type_of_field_is_written_and_read(encoding: str):
         assert found.dtype.names == given.dtype.names
         for name in given.dtype.names:
             assert found[name].tobytes() == given[name].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("encoding", "seconds", "words"),
+    [
+        ("ros1", 2**32 - 1, None),
+        ("ros1", 2**31, None),
+        ("ros1", -1, "not one of ROS 1"),
+        ("ros1", 2**32, "not one of ROS 1"),
+        ("cdr", 2**31 - 1, None),
+        ("cdr", -(2**31), None),
+        ("cdr", 2**31, "not one of ROS 2"),
+    ],
+)
+def test_times_are_those_that_ros_counts(encoding, seconds, words):
+    """ROS 1's seconds are unsigned, ROS 2's are signed, both of 32 bits."""
+    with nullcontext() if words is None else pytest.raises(InputError, match=words):
+        message = written(Cloud.of(rows(9)), 10**9 * seconds, "", encoding)
+        # after ROS 1's sequence, and after the head of CDR
+        (stored,) = struct.unpack_from("<I" if encoding == "ros1" else "<i", message, 4)
+        assert stored == seconds
 
 
 def test_a_grid_becomes_rows_of_which_none_is_nan():
