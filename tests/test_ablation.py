@@ -142,11 +142,12 @@ def test_the_first_combination_meets_the_best_that_is_as_fast():
         {
             "a": over_seeds([row(0.5, 0.5), row(1, 0.3, evaluations=2)]),
             "b": [row(0.9, 0.6), row(1.05, 0.4), row(2, 0.1)],
-        }
+        },
+        row(0, 0.4, combination="mean scan"),
     )
-    assert [(line["in"], line["b"]) for line in found] == [
-        ("1", "ahead (slower, 0.600)"),
-        ("2", "ahead (0.400)"),
+    assert [(line["in"], line["b"], line["mean scan"]) for line in found] == [
+        ("1", "ahead of 0.600 in 0.9 s", "behind 0.400"),
+        ("2", "ahead of 0.400", "ahead of 0.400"),
     ]
 
 
@@ -155,7 +156,7 @@ def test_an_ablation_ends_with_a_table_and_resumes(tmp_path, r2flow, quick_pictu
     command = ["ablate", *keys, "--seeds", "1", "--num", "2", "--evaluations", "2"]
     command += ["--out", tmp_path / "out", "--budget"]
     done = r2flow(*command, "1s")
-    assert "velocity at equal seconds a scan" in done.said
+    assert "velocity by network evaluations" in done.said
     assert "[1/2]" in done.said
     table = tmp_path / "out" / "ablation.csv"
     rows = list(csv.DictReader(table.open()))
@@ -175,7 +176,7 @@ def test_an_ablation_ends_with_a_table_and_resumes(tmp_path, r2flow, quick_pictu
     shutil.rmtree(tmp_path / "out")
     again = r2flow(*command, "1s", "--rows", moved)
     assert "[1/2]" not in again.said
-    assert "velocity at equal seconds a scan" in again.said
+    assert "velocity by network evaluations" in again.said
     assert list(csv.DictReader(moved.open())) == rows
     # its steps repeat its runs, here two at once
     repeated = tmp_path / "repeated.csv"

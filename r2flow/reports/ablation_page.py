@@ -78,24 +78,41 @@ def verdict(ours: Row, other: Row) -> str:
     return "ahead" if difference > 0 else "behind"
 
 
-def _against(ours: Row, rows: Sequence[Row]) -> str:
-    """The verdict against another's best row that is as fast, else against its fastest one."""
+def _against(ours: Row, other: Row) -> str:
+    """A verdict with the other's distance."""
+    preposition = {"ahead": " of", "level": " with", "behind": ""}
+    word = verdict(ours, other)
+    return f"{word}{preposition[word]} {other[_DISTANCE]:.3f}"
+
+
+def _against_system(ours: Row, rows: Sequence[Row]) -> str:
+    """The verdict against another's best row that is as fast, else against its fastest one, with
+    its seconds.
+    """
     fast = [r for r in rows if r["seconds a scan"] <= _AS_FAST * ours["seconds a scan"]]
-    other = frontier(fast or rows)[-1 if fast else 0]
-    return f"{verdict(ours, other)} ({'' if fast else 'slower, '}{other[_DISTANCE]:.3f})"
+    if fast:
+        return _against(ours, frontier(fast)[-1])
+    fastest = frontier(rows)[0]
+    return f"{_against(ours, fastest)} in {fastest['seconds a scan']:.2g} s"
 
 
-def compared(systems: _Systems) -> list[Row]:
+def compared(systems: _Systems, baseline: Row) -> list[Row]:
     """The best row of the first combination in each number of evaluations against the others at
-    equal seconds a scan.
+    equal seconds a scan, and against a baseline.
     """
     first, *others = systems
     found = []
     for count in sorted({row["evaluations"] for row in systems[first]}):
         rows = [row for row in systems[first] if row["evaluations"] == count]
         best = min(rows, key=lambda row: row[_DISTANCE])
-        row = {"in": f"{count:g}", "model": best["model"], first: best["shown"]}
-        found.append(row | {name: _against(best, systems[name]) for name in others})
+        row = {
+            "in": f"{count:g}",
+            "model": best["model"],
+            "s": f"{best['seconds a scan']:.2g}",
+            first: best["shown"],
+            baseline["combination"]: _against(best, baseline),
+        }
+        found.append(row | {name: _against_system(best, systems[name]) for name in others})
     return found
 
 
@@ -120,10 +137,11 @@ def ablation_page(
             distances = [row[_DISTANCE] for row in runs if row["budget"] == seconds]
             learned[name][f"{seconds / 60:.3g} min"] = min(distances)
     lines = [references[0], *(row for each in systems.values() for row in each), last]
-    against = compared(systems)
+    against = compared(systems, last)
     headings = {key: key for row in learned.values() for key in row}
     text: list[Part] = [
-        f"{next(iter(systems))} at equal seconds a scan, by network evaluations:",
+        f"{next(iter(systems))} by network evaluations, with its seconds a scan, against what is "
+        "as fast; of slower ones their seconds are named:",
         Table(against, {key: key for key in against[0]}),
         f"Smallest distance by training time; {last['combination']}: {last[_DISTANCE]:.3f}.",
         Table(list(learned.values()), headings),
