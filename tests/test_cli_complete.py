@@ -23,6 +23,7 @@ from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS, write_sensor
 from r2flow.model import checkpoint
 from r2flow.reports import answers
+from r2flow.reports.answer_counts import more_rows
 from r2flow.simulator import simulate
 from tests.conftest import SENSOR, Done, prepare_folder, write_run
 from tests.test_completion import network
@@ -161,6 +162,20 @@ def test_finished_scans_are_passed_over_and_the_others_come_out_the_same(complet
     assert np.array_equal(image[:, kept], answer[:, kept])
 
 
+def test_a_scan_that_fills_the_image_is_told_what_adds_points(complete, tmp_path):
+    """The options that are named add as many rows as there are beams."""
+    xyz = sparse_scan(tmp_path / "room.pcd", steps=200)
+    given = tmp_path / "room.pcd", "--from", "vlp16", "--to", "vlp16"
+    said = complete(*given, "--size", "16x64").said
+    named = "--to vlp16 --size 32x64"
+    assert f"room: hardly a new point, as the scan fills all 16x64 rays; {named} has rows" in said
+    assert said.endswith(", 0 new points a scan\n")
+    assert "hardly" not in complete(*given[:3], *named.split(), out=tmp_path / "more").said
+    assert len(xyz) + 500 < len(read_points(tmp_path / "more" / "room.pcd").xyz) <= len(xyz) + 1024
+    assert more_rows(VLP16, own=False, image=True) == "--from vlp16 --size 32x1024"
+    assert more_rows(replace(VLP16, name="mine"), own=True).startswith("--to FILE (r2flow sensor")
+
+
 def test_the_gaps_of_a_thinned_scan_are_filled_where_asked(complete, tmp_path):
     """Returns come back to the bit and some gaps return; without the option all gaps are rays
     without a return.
@@ -278,6 +293,9 @@ def test_a_run_completes_a_recording_with_the_options_of_scans(complete, r2flow,
     wrong = complete(drive, "--from", "hdl64e", out=dense)
     assert wrong.said.startswith(f"{dense}: 1 of 1 clouds of /points completed")
     assert f"{drive}: sensor hdl64e does not fit these scans" in wrong.stderr
+    own = "--from", "vlp16", "--to", "vlp16", "--size", "16x64"
+    said = complete(drive, *own, out=tmp_path / "own.mcap").said
+    assert said.endswith("0 new points a cloud\nhardly a new point: see --to vlp16 --size 32x64\n")
 
 
 def test_two_fields_of_one_name_are_found_before_the_model_runs(complete, tmp_path):

@@ -1,14 +1,16 @@
 """`r2flow complete`."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from typer import Argument, Option
 
 from r2flow.base.devices import choose_device
-from r2flow.base.errors import check
+from r2flow.base.errors import InputError, check
 from r2flow.base.files import check_folder
 from r2flow.cli.app import app
 from r2flow.cli.options import (
@@ -180,6 +182,7 @@ def complete(
     from r2flow.lidar.labels import SEMANTIC_KITTI, label_list
     from r2flow.model.completion import completing, usual_precision
     from r2flow.model.shipped import DEFAULT, DENSIFY
+    from r2flow.reports.answer_counts import LITTLE, more_rows
     from r2flow.reports.answer_rays import Job, lack_sectors
     from r2flow.reports.answers import write_completed
     from r2flow.reports.outputs import recipe_of
@@ -199,7 +202,7 @@ def complete(
         recipe = recipe_of(model, seed, sampler, completion={**settings})
         completer = model.completer(settings.pop("from"), sampler=sampler, **settings)
 
-        complete_recording(
+        new = complete_recording(
             Path(what[0]),
             out,
             part.topic,
@@ -207,6 +210,10 @@ def complete(
             lambda cloud, number: completer.completed(cloud, number, seed, what[0]),
             recipe,
         )
+        with suppress(InputError):  # of a recording whose clouds were completed before
+            if new < LITTLE * prod(completer.sensor.shape):
+                own = model.chosen or completer.sensor != model.sensor
+                print(f"hardly a new point: see {more_rows(completer.sensor, own)}")
         return
     check_folder(out)
     job = Job(

@@ -5,12 +5,26 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy import ndarray
 
+from r2flow.generators import TransferFlow
 from r2flow.lidar.added import unknown_fields
 from r2flow.lidar.known import Ray
 from r2flow.lidar.labels import COMMON
 from r2flow.lidar.scan_files import WRITTEN
-from r2flow.lidar.sensors import Sensor
+from r2flow.lidar.sensors import SENSORS, Sensor
+from r2flow.model.checkpoint import Checkpoint
 from r2flow.reports.answer_rays import Answered
+
+LITTLE = 0.01  # new points a pixel; why there are fewer is told
+
+
+def more_rows(sensor: Sensor, own: bool, image: bool = False) -> str:
+    """Options by which answers get rows between the beams of scans of this sensor, `own`: which is
+    not the model's.
+    """
+    rows, columns = sensor.shape
+    name = sensor.name if sensor.name in SENSORS else "FILE (r2flow sensor SCANS --out FILE)"
+    source = f"--from {name} " if image else ""
+    return f"{source}{f'--to {name} ' if own else ''}--size {2 * rows}x{columns}"
 
 
 @dataclass
@@ -20,24 +34,27 @@ class Counts:
     rays: ndarray = field(default_factory=lambda: np.zeros(len(Ray), int))  # of each state
     outside: int = 0  # points
     added: int = 0
+    little: list[str] = field(default_factory=list)  # names of scans with next to no new points
+    open: float = 0.0  # largest share of unmeasured rays of these
+    points: bool = False  # whether there are scans of points
     classes: ndarray = field(default_factory=lambda: np.zeros(1 + len(COMMON), int))  # pixels
     unknown: dict[str, None] = field(default_factory=dict)  # fields that added points lack
     beside: bool = False  # whether fields lie in files beside those of the points
 
     def add(self, answered: Answered) -> None:
         scan, known = answered.scan, answered.known
-        if not answered.completed.evaluations.any():
-            print(
-                f"{scan.name}: every ray of the image is measured, so nothing is added; see "
-                "--size, --from, --fill-gaps and --mask"
-            )
         images = answered.completed.images.numpy()
         returned = images[:, 0] > 0
         if images.shape[1] > 2:
             found = images[:, 2][returned].astype(int)
             self.classes += np.bincount(found, minlength=len(self.classes))
-        self.added += int((returned & (known.state != Ray.RETURN)).sum())
+        new = int((returned & (known.state != Ray.RETURN)).sum())
+        self.added += new
+        if new < LITTLE * returned.size:
+            self.little.append(scan.name)
+            self.open = max(self.open, (known.state == Ray.UNKNOWN).mean())
         if not scan.image:
+            self.points = True
             self.rays += np.bincount(known.state.ravel(), minlength=len(Ray))
         if known.points and known.points.cloud:
             cloud = known.points.cloud
@@ -45,8 +62,9 @@ class Counts:
             self.unknown |= dict.fromkeys(unknown_fields(cloud))
             self.beside |= cloud.names is None and scan.ending in WRITTEN
 
-    def lines(self, sensor: Sensor) -> list[str]:
-        """What was taken of points."""
+    def lines(self, model: Checkpoint, max_error: float | None = None) -> list[str]:
+        """What was taken of points, and why little was added."""
+        sensor = model.sensor
         lines = []
         share = self.rays[Ray.EMPTY] / max(self.rays[Ray.EMPTY] + self.rays[Ray.RETURN], 1)
         if share > 0.5:  # 31 % at most of real scans
@@ -66,9 +84,27 @@ class Counts:
                 f"used: the nearest point in each pixel of {rows}x{columns}; {self.outside:,} "
                 f"outside {sensor.min_range:g}-{sensor.max_range:g} m left out"
             )
+        if self.little:
+            lines.append(self._why_little(model, max_error))
         if (total := self.classes.sum()) > 0:
             named = zip(self.classes / total, ["no class", *COMMON], strict=True)
             largest = sorted(named, reverse=True)
             told = ", ".join(f"{name} {share:.0%}" for share, name in largest if share >= 0.005)
             lines.append(f"classes of the pixels with a return: {told}")
         return lines
+
+    def _why_little(self, model: Checkpoint, max_error: float | None) -> str:
+        first, *others = self.little
+        more = f" and {len(others)} more" if others else ""
+        rows, columns = model.sensor.shape
+        if self.open < 0.1:
+            why = f"the scan fills all {rows}x{columns} rays; "
+            if isinstance(model.generator, TransferFlow):
+                finer = more_rows(model.sensor, model.chosen, not self.points)
+                why += f"{finer} has rows between them, "
+            why += "--mask rows:4 hides some to compare"
+        elif max_error:
+            why = f"points with an error_68 above {max_error:g} m are left out; see --max-error"
+        else:
+            why = "the unmeasured rays are in whole sectors, beyond the beams, or return nothing"
+        return f"{first}{more}: hardly a new point, as {why}"

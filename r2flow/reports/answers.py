@@ -77,7 +77,7 @@ def write_completed(
                 draw_answers(checkpoint.sensor, answered, out, beside.get(name))
             counts.add(answered)
         bar.set(len(left) * job.num)
-    lines = counts.lines(checkpoint.sensor)
+    lines = counts.lines(checkpoint, job.max_error)
     if beside:
         from r2flow.reports.answer_errors import COMPARE, in_words
 

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import logging
+import math
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -34,8 +35,9 @@ def complete_recording(
     everything: bool,
     complete: _Completion,
     recipe: dict[str, Any],
-) -> None:
-    """Write a recording whose clouds of a topic are completed, with their headers; print counts.
+) -> float:
+    """Write a recording whose clouds of a topic are completed, with their headers; print counts and
+    return the new points a cloud, NaN if it is there already.
 
     Clouds that cannot be completed, as empty ones, stay as they are, with a line. `out` appears
     when it is whole, beside it `OUT.json` with the settings; parts are in `OUT.parts` until then.
@@ -63,7 +65,7 @@ def complete_recording(
             same = notes.is_file() and read_json(notes).get("recipe") == store.described
             check(same, f"{out} exists and is of other settings; give another --out.")
             print(f"{out} is there already")
-            return
+            return math.nan
         count = sum(channel.count for channel in of_topic if channel.kind == CLOUD)
         store.begin()
         done, added = _make_parts(recording, topic, complete, store, count)
@@ -72,8 +74,9 @@ def complete_recording(
         messages = _replaced(recording, None if everything else topic, topic, store)
         write_recording(out, kept, track(messages, "writing", "messages", total))
         shutil.rmtree(store.folder)
-    new = f"{added / done:,.0f} new points a cloud"
-    print(f"{out}: {done} of {count} clouds of {topic} completed, {new}")
+    new = added / done
+    print(f"{out}: {done} of {count} clouds of {topic} completed, {new:,.0f} new points a cloud")
+    return new
 
 
 def _make_parts(
