@@ -18,6 +18,7 @@ from torch.utils.data import DataLoader
 
 import r2flow
 from r2flow import Distill, Rectify, Reflow, ScanDataModule
+from r2flow.backbones import BACKBONES
 from r2flow.base.errors import InputError
 from r2flow.lidar.sensors import SENSORS
 from tests.conftest import ROOT, quiet_trainer
@@ -325,7 +326,7 @@ class OwnNetwork(torch.nn.Module):
         return self.last(torch.relu(self.first(torch.cat([x, t], 1))))
 
 
-def test_any_module_is_a_velocity(tmp_path: Path):
+def test_any_module_is_a_velocity(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     network = OwnNetwork()
     first = copy.deepcopy(network)
     module = Rectify(network, SENSOR, warmup_images=8)
@@ -340,11 +341,21 @@ def test_any_module_is_a_velocity(tmp_path: Path):
     )
     trainer.fit(module, scans())
     for load in (Rectify.load_from_checkpoint, r2flow.load, lambda path: Reflow(parent=path)):
-        with pytest.raises(InputError, match=r"is a OwnNetwork.*give backbone=OwnNetwork"):
+        with pytest.raises(
+            InputError, match=r"is a OwnNetwork.*give --plugin .* backbone=OwnNetwork"
+        ):
             load(last)
     loaded = Rectify.load_from_checkpoint(last, backbone=OwnNetwork())
     model = r2flow.load(last, backbone=OwnNetwork())
     torch.testing.assert_close(loaded.sample(2, seed=3), model.sample(2, seed=3))
+    monkeypatch.setattr(BACKBONES, "_entries", {})
+    BACKBONES.add("own_net", OwnNetwork)  # as by a plug-in
+    assert r2flow.load(last).config.backbone == "own_net"
+    torch.testing.assert_close(r2flow.load(last).sample(2, seed=3), model.sample(2, seed=3))
+    monkeypatch.setattr(OwnNetwork.__init__, "__defaults__", (6,))
+    with pytest.raises(InputError, match="OwnNetwork by its defaults: its weights do not fit"):
+        r2flow.load(last)
+    monkeypatch.undo()
     averaged = torch.load(last)["state_dict"]["generator.backbone.network.last.weight"]
     assert torch.equal(loaded.backbone.last.weight, averaged)
     ends = []

@@ -11,7 +11,7 @@ from r2flow.backbones.base import Backbone
 from r2flow.backbones.efficient_unet import EfficientUNet
 from r2flow.backbones.hdit import HDiT
 from r2flow.backbones.local import Local
-from r2flow.backbones.module import MODULE, module_backbone
+from r2flow.backbones.module import MODULE, backbone_class, module_backbone
 from r2flow.backbones.vit import ViT
 from r2flow.base.errors import InputError
 from r2flow.base.registry import Config, Options, Registry, presets
@@ -38,11 +38,24 @@ class _Backbones(Registry[Callable[..., Backbone]]):
         options = self.options(name)
         return partial(self[options.pop("name")], **options)
 
+    def add(self, name: str, entry: Any) -> None:
+        """As `Registry.add`; of any class of modules that is called as `module(t, x)`."""
+        if isinstance(entry, type) and not issubclass(entry, Backbone):
+            entry = backbone_class(entry)
+        super().add(name, entry)
+
     def options(self, given: str | Options | nn.Module) -> Config:
-        """As `Registry.options`; also of a module of one's own."""
+        """As `Registry.options`; also of a module of one's own.
+
+        Where only the class of that is known, as to a checkpoint, an entry of this class is taken.
+        """
         if isinstance(given, nn.Module):
             return {"name": MODULE, "network": given}
-        return super().options(given)
+        options = super().options(given)
+        for name, entry in self._entries.items():
+            if options.get("network") == getattr(entry, "__name__", ""):
+                return {"name": name}
+        return options
 
     def build(  # type: ignore[override]
         self,

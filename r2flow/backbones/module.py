@@ -1,11 +1,13 @@
-"""A module of one's own in the place of a backbone by name."""
+"""Modules of one's own in the place of a backbone."""
 
-from typing import Any
+from inspect import Parameter, Signature, signature
+from typing import Any, ClassVar
 
 from torch import Tensor, nn
 
 from r2flow.backbones.base import Backbone
-from r2flow.base.errors import InputError
+from r2flow.base.errors import InputError, check
+from r2flow.base.registry import keywords_of
 
 MODULE = "own"  # its name in a config, where `network` is its class
 
@@ -29,7 +31,48 @@ def module_backbone(rays: Tensor, network: nn.Module | str, **common: Any) -> Ba
     """
     if isinstance(network, str):
         raise InputError(
-            f"its network is a {network}, a module of its user: give backbone={network}(...) to "
+            f"its network is a {network}, a class of its user: give --plugin FILE.py, a file with "
+            f"BACKBONES.add('my_net', {network}), or in Python backbone={network}(...) to "
             "load_from_checkpoint, r2flow.load or a stage with this parent."
         )
     return network if isinstance(network, Backbone) else ModuleBackbone(rays, network, **common)
+
+
+def backbone_class(module: Any) -> type[Backbone]:
+    """The class of backbones v(t, x) by a class of modules.
+
+    Its options are those of the module and of `Backbone`. The module gets the rays and the options
+    of `Backbone`, such as in_channels, that its constructor names.
+
+    Raises:
+        InputError: the module takes the time after the image.
+    """
+    order = [*signature(module.forward).bind(None, None, None).arguments]  # self, t, x
+    check(
+        not "".join(order[2:]).startswith("t"),
+        f"{module.__name__}.forward takes {order[-1]} last, not first: see docs/extend.md.",
+    )
+    own = keywords_of(module)
+    common = keywords_of(Backbone, given=2)
+
+    class Own(ModuleBackbone):
+        __signature__: ClassVar[Signature]
+
+        def __init__(
+            self,
+            rays: Tensor,
+            in_channels: int = 2,
+            out_channels: int | None = None,
+            **options: Any,
+        ) -> None:
+            out_channels = out_channels or in_channels
+            options |= {"rays": rays, "in_channels": in_channels, "out_channels": out_channels}
+            network = module(**{name: options[name] for name in options.keys() & own})
+            shared = {name: options[name] for name in options.keys() & common}
+            super().__init__(rays, network, **shared)
+
+    rays = Parameter("rays", Parameter.POSITIONAL_ONLY)
+    named = [one.replace(kind=one.KEYWORD_ONLY) for one in {**own, **common}.values()]
+    Own.__signature__ = Signature([rays, *(one for one in named if one.name != "rays")])
+    Own.__name__, Own.__module__ = module.__name__, module.__module__
+    return Own

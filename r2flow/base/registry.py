@@ -256,7 +256,7 @@ def options_of(constructor: Callable[..., Any], given: int = 0) -> Config:
     """Keyword options of a constructor, after `given` positional ones, with their defaults;
     `MISSING` without one.
     """
-    parameters = _by_keyword(constructor, given)
+    parameters = keywords_of(constructor, given)
     return {name: MISSING if p.default is p.empty else p.default for name, p in parameters.items()}
 
 
@@ -289,7 +289,7 @@ def signature_of(constructor: Callable[..., Any]) -> inspect.Signature:
     return signature.replace(parameters=sorted([*parameters, *taken], key=lambda p: p.kind))
 
 
-def _by_keyword(constructor: Callable[..., Any], given: int = 0) -> dict[str, inspect.Parameter]:
+def keywords_of(constructor: Callable[..., Any], given: int = 0) -> dict[str, inspect.Parameter]:
     """Parameters that can be given by keyword, after `given` positional ones."""
     named = [p for p in signature_of(constructor).parameters.values() if p.kind not in _SEVERAL]
     positional = [p for p in named if p.kind is not p.KEYWORD_ONLY][:given]
@@ -299,7 +299,7 @@ def _by_keyword(constructor: Callable[..., Any], given: int = 0) -> dict[str, in
 @cache
 def _schema(constructor: Callable[..., Any], given: int) -> TypeAdapter[Config]:
     fields: Config = {}
-    for name, parameter in _by_keyword(constructor, given).items():
+    for name, parameter in keywords_of(constructor, given).items():
         annotation = Any if parameter.annotation is parameter.empty else parameter.annotation
         required = parameter.default is parameter.empty
         fields[name] = Required[annotation] if required else NotRequired[annotation]
@@ -323,7 +323,7 @@ def _first_problem(
     if problem["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         if len(problem["loc"]) > 1:
             return f"no option '{option}'."
-        known = list(_by_keyword(constructor, given))
+        known = list(keywords_of(constructor, given))
         hint = did_you_mean(option, known)
         return f"no option '{option}'; it has {', '.join(known) or 'none'}.{hint}"
     if problem["type"] in ("missing", "missing_argument"):

@@ -377,9 +377,16 @@ def _of_torch(content: Any, path: Path, averaged: bool, backbone: nn.Module | No
         config = config_of(
             content[HYPER], content.get("datamodule_hyper_parameters") or {}, notes["stage"]
         )
+        network = config["backbone"]
+        about = str(path)
+        if backbone is None and network and "network" in network:  # its class alone
+            config["backbone"] = BACKBONES.options(network)
+            if config["backbone"] != network:
+                about += f": {network['network']} by its defaults"
         config |= {"plugins": notes["plugins"], "trainer": {"max_steps": notes["total_steps"]}}
         step = int(content.get("global_step", 0))
-        return _built(ModelConfig(config), weights, notes, path, step, backbone)
+        with naming(about):
+            return _built(ModelConfig(config), weights, notes, path, step, backbone)
     systems = ", ".join(known.system for known in FORMATS.values())
     found = (
         ", ".join(map(repr, list(content)[:6]))

@@ -12,6 +12,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from tiny_backbones import COLUMNS, NAMES, PUBLISHED, ROWS, image, tiny, untrained
+from torch import nn
 
 from r2flow.backbones import BACKBONES
 from r2flow.base.errors import InputError
@@ -260,3 +261,44 @@ def test_names_and_shapes_are_the_published_models(config, shared):
         for key, value in model.state_dict().items()
     }
     assert found == {key: (shape, kind) for key, shape, kind in expected}
+
+
+class Scaled(nn.Module):
+    """factor t x, of the first channels."""
+
+    def __init__(self, factor: float, out_channels: int, rays=None) -> None:
+        super().__init__()
+        self.factor, self.out_channels, self.rays = factor, out_channels, rays
+
+    def forward(self, t, x):
+        return self.factor * t[:, None, None, None] * x[:, : self.out_channels]
+
+
+@pytest.fixture
+def scaled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(BACKBONES, "_entries", dict(BACKBONES._entries))
+    BACKBONES.add("scaled", Scaled)
+
+
+def test_any_class_of_modules_becomes_a_backbone_and_gets_what_it_names(scaled):
+    x = torch.randn(3, 5, 4, 8)
+    t = torch.tensor([0.0, 0.5, 1.0])
+    rays = torch.rand(2, 4, 8)
+    model = BACKBONES.build({"name": "scaled", "factor": 3}, rays, in_channels=5, out_channels=2)
+    torch.testing.assert_close(model(t, x), 3 * t[:, None, None, None] * x[:, :2])
+    assert model.network.rays is rays
+    with pytest.raises(InputError, match="backbone 'scaled': needs the option 'factor'"):
+        BACKBONES.build("scaled", rays)
+    with pytest.raises(InputError, match="no option 'widht'; it has factor, out_channels, in_ch"):
+        BACKBONES.build({"name": "scaled", "factor": 3, "widht": 3}, rays)
+    with pytest.raises(InputError, match="Scaled takes no second time"):
+        BACKBONES.build({"name": "scaled", "factor": 3}, rays, second_time=True)
+
+
+def test_a_module_that_takes_the_time_last_is_refused():
+    class Late(nn.Module):
+        def forward(self, sample, timestep):
+            return sample
+
+    with pytest.raises(InputError, match="Late.forward takes timestep last, not first"):
+        BACKBONES.add("late", Late)

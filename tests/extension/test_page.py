@@ -30,6 +30,7 @@ def plugins(tmp_path: Path, monkeypatch) -> Iterator[Path]:
     ("name", "choices"),
     [
         ("my_backbone", ["backbone=my_backbone", "backbone.channels=4"]),
+        ("my_unet", ["backbone=my_unet", "backbone.width=4"]),
         ("near_loss", ["stage=near_loss", "stage.weight=2"]),
         ("corridors", ["data=corridors", "backbone=hdit_tiny"]),
     ],
@@ -38,6 +39,18 @@ def test_a_plug_in_of_the_page_trains(plugins: Path, name: str, choices: list[st
     tiny = [one for one in TINY if name != "corridors" or not one.startswith("data.scenes")]
     done = r2flow("train", f"--plugin={name}.py", *tiny, *choices, "run_dir=run")
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_adapter_of_the_page_turns_the_time_of_the_flow_into_steps_of_noise():
+    import torch
+
+    space = {}
+    with loaded():
+        exec(BLOCKS["my_unet"], space)
+    network = space["MyUNet"](2, 2)
+    network.unet.forward = lambda sample, timestep: SimpleNamespace(sample=timestep)
+    x = torch.zeros(3, 2, 4, 8)
+    assert network(torch.tensor([0.0, 0.25, 1.0]), x).tolist() == [1000, 750, 0]
 
 
 def test_the_sampler_of_the_page_takes_a_share_of_each_step():
