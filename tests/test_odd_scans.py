@@ -109,6 +109,7 @@ def test_a_sensor_file_with_aliases_or_long_values_is_one_short_line(r2flow, tmp
         f"name: mine\nelevations: [{', '.join(['a'] * 10_000)}]\n",
         f"name: mine\ncolumns: {'9' * 5000}\nelevations: [2.0, 1.0]\n",
         f"{'x' * 10_000}: 1\n",
+        f"name: mine\nelevations: {'[' * 1000}\n",
     ):
         file.write_text(text)
         line = r2flow("show", "simulated:0", "--sensor", file, "--out", tmp_path / "o").refusal

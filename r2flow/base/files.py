@@ -132,15 +132,32 @@ def read_json(path: Path) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
+_DEEPEST = 50  # levels of a YAML document
+_BEGINS = (
+    yaml.FlowSequenceStartToken,
+    yaml.FlowMappingStartToken,
+    yaml.BlockSequenceStartToken,
+    yaml.BlockMappingStartToken,
+)
+_ENDS = (yaml.FlowSequenceEndToken, yaml.FlowMappingEndToken, yaml.BlockEndToken)
+
+
 def parse_yaml(text: str, most_aliases: int = 0) -> Any:
     """Plain values of a YAML document.
 
     Raises:
-        InputError: it has more aliases, as nested ones can stand for any size, or a key twice.
+        InputError: it has more aliases, as nested ones can stand for any size, or a key twice, or
+            is nested deeply, which takes long to read.
     """
-    aliases = sum(isinstance(token, yaml.AliasToken) for token in yaml.scan(text))
-    few = aliases <= most_aliases
-    check(few, "it has aliases (*NAME), which can stand for any size: write them out.")
+    aliases = depth = 0
+    for token in yaml.scan(text):
+        aliases += isinstance(token, yaml.AliasToken)
+        depth += isinstance(token, _BEGINS) - isinstance(token, _ENDS)
+        check(
+            aliases <= most_aliases,
+            "it has aliases (*NAME), which can stand for any size: write them out.",
+        )
+        check(depth <= _DEEPEST, f"it is nested more than {_DEEPEST} deep.")
     return yaml.load(text, _OneOfEachKey)
 
 

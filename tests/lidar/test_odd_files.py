@@ -5,7 +5,7 @@ import pytest
 
 from r2flow.base.errors import InputError, _warned
 from r2flow.lidar.bags import read_bag
-from r2flow.lidar.scan_files import NoPointsError, read_points, read_range_image
+from r2flow.lidar.scan_files import NoPointsError, points_beside, read_points, read_range_image
 from r2flow.model.tensor_files import read_checkpoint, read_tensors
 
 
@@ -103,6 +103,11 @@ def ply(kind: str, name: str, count: int, row: str) -> str:
         "label",
         "valid",
         "is_ground",
+        "packed_rgb",
+        "n_x",
+        "nanosec",
+        "semantic",
+        "intensity_index",
     ],
 )
 def test_what_is_no_reflectance_is_not_proposed_as_one(tmp_path, caplog, name):
@@ -122,6 +127,9 @@ def test_a_ply_of_bool_no_vertices_or_lists_is_answered_in_words(tmp_path):
     path.write_text(ply("bool", "valid", 0, ""))
     with pytest.raises(NoPointsError, match="it holds no points: leave it out"):
         read_points(path)
+    path.write_text("ply\nformat ascii 1.0\nend_header\n")
+    with pytest.raises(InputError, match="it has no element 'vertex', the points"):
+        read_points(path)
     path.write_text(ply("list uchar int", "echoes", 3, "1 4"))
     with pytest.raises(InputError, match="have a property 'uchar int echoes', a list"):
         read_points(path)
@@ -135,3 +143,12 @@ def test_as_many_names_are_advised_as_there_are_columns(tmp_path):
             InputError, match=f"{width} columns, not 4: name all by --columns {names} "
         ):
             read_points(tmp_path / "scan.npy")
+
+
+def test_points_in_numpy_s_format_are_read_beside_another_file_of_their_name(tmp_path):
+    image, points = tmp_path / "scan.npy", tmp_path / "scan.bin"
+    for path in (image, points):
+        path.touch()
+    assert points_beside(image) == image
+    (tmp_path / "manifest.json").touch()  # r2flow wrote both
+    assert points_beside(image) == points

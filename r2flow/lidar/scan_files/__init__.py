@@ -173,8 +173,8 @@ def conversion_of(path: str | Path) -> str | None:
 
 
 def points_beside(path: Path) -> Path:
-    """The file of points next to a range image of the same name, if there is one; else the path."""
-    if path.suffix.lower() == ".npy":
+    """The file of points next to a range image that r2flow has written; else the path."""
+    if path.suffix.lower() == ".npy" and (path.parent / "manifest.json").is_file():
         for ending in (".bin", ".pcd", ".ply"):
             if path.with_suffix(ending).is_file():
                 return path.with_suffix(ending)

@@ -113,7 +113,9 @@ def write_pcd(file: IO[bytes], cloud: Cloud) -> None:
 def _read_ply(path: Path) -> Cloud:
     """All properties of the element `vertex`, the first; later ones, as of a mesh, are ignored."""
     text, body = _split_header(path.read_bytes())
-    head, vertex, *others = text.split("\nelement ")
+    head, *elements = text.split("\nelement ")
+    check(elements, "it has no element 'vertex', the points.")
+    vertex, *others = elements
     _, encoding, _ = re.split(r"^format (\w+)", head, flags=re.MULTILINE)
     properties = re.findall(r"^property (\w+) (.+)", vertex, re.MULTILINE)
     name, count = vertex.split()[:2]

@@ -36,13 +36,11 @@ _ROLES: Mapping[str, tuple[str, ...]] = {
     **{name: (name,) for name in OWN},
 }  # fmt: skip
 _ONCE = ("x", "y", "z", "reflectance", "ring")  # a file's columns name each at most once
-# What no reflectance is called: colours, normals, times, labels, angles, distances and flags.
-_OTHERS = re.compile(
-    "rgba?|[rgbat]|red|green|blue|alpha|colou?rs?.*|n[xyz]|normals?.*|curvature|.*(time|stamp).*"
-    "|ts|dt|t_.*|.*(label|class|instance|segment|index).*|id|range|distance|depth|azimuth|elevation"
-    "|(row|col).*|returns?.*|.*return_?(number|type).*|confidence|v[xyz]|velocity.*"
-    "|valid|mask|flags?|status|is_.*"
+# What may be a reflectance: a field of any other name is never proposed as one.
+_LIKE_REFLECTANCE = re.compile(
+    "intens|reflec|remiss|amplitude|signal|strength|power|gain|albedo|bright"
 )
+_OF_IT = re.compile("time|stamp|valid|flag|index|label|id$")  # what is said of it
 _ROLE_OF = {alias: role for role, aliases in _ROLES.items() for alias in aliases}
 
 
@@ -239,9 +237,9 @@ def warn_of_unused(
     unused = [
         name
         for name, column in zip(names, columns, strict=True)
-        if name.strip("_")
-        and not role_of(name)
-        and not _OTHERS.fullmatch(_plain(name))
+        if not role_of(name)
+        and _LIKE_REFLECTANCE.search(_plain(name))
+        and not _OF_IT.search(_plain(name))
         and column.ndim == 1
         and column.dtype.kind in "fiu"
     ]
