@@ -34,8 +34,8 @@ def check_ending(out: Path, recording: Recording) -> None:
     endings = _WRITTEN[recording.storage]
     check(
         out.suffix.lower() in endings,
-        f"{out}: a recording that is stored as {recording.storage} is written as "
-        f"{' or '.join(endings)}.",
+        f"{out}: a recording that is stored as {recording.storage} is written as a file: give "
+        f"--out {' or '.join(str(out.with_suffix(ending)) for ending in endings)}.",
     )
 
 
