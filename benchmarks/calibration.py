@@ -213,7 +213,7 @@ def own_rows(name: str, folder: Path, judged: Path) -> Iterator[list[str]]:
         file = Path(place, "mine.yaml")
         about = [read_points(path) for path in sorted(folder.iterdir())[:3]]
         write_sensor(estimate_sensor(about, "mine").sensor, file, "")
-        factors = calibrate(model, str(folder), file).factors
+        factors = calibrate(model, str(folder), str(file), file).factors
     scale = sensor.reflectance_scale
     reading = Reading(sensor, reflectance_scale=scale or 1.0, reflectance=scale is not None)
     flow = model.through(sensor)

@@ -11,7 +11,7 @@ from r2flow.base.errors import InputError
 from r2flow.generators.answers import NEVER, Answers
 from r2flow.generators.calibration import fitted, mixture
 from r2flow.lidar.known import ray_states
-from r2flow.lidar.sensors import read_sensor, write_sensor
+from r2flow.lidar.sensors import SENSORS, read_sensor, write_sensor
 from r2flow.model.completion import complete
 from r2flow.reports.calibration import TASKS, trust_of
 from r2flow.reports.completion import kept_rays
@@ -172,3 +172,25 @@ def test_calibrate_writes_the_factors_into_the_file_of_the_sensor(r2flow, tmp_pa
     assert factors == trust_of(flow.through(mine), images).factors
     said, about, *_ = path.read_text().splitlines()
     assert (said, about) == ("# of my own", "# error_factors: r2flow calibrate, tiny, 2 scans")
+
+
+def test_calibrate_takes_a_sensor_by_name_and_writes_it_to_a_new_file(
+    r2flow, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("r2flow.reports.calibration._FEWEST", 100)
+    flow = network()
+    flow.save(tmp_path / "tiny.safetensors")
+    how = ("-c", tmp_path / "tiny.safetensors", "--num", 1)
+    refusal = r2flow("calibrate", "simulated:1", "--sensor", "hdl64e_small", *how).refusal
+    assert "give --out hdl64e_small_mine.yaml" in refusal
+    mine = tmp_path / "mine.yaml"
+    said = r2flow("calibrate", "simulated:1", "--sensor", "hdl64e_small", *how, "--out", mine).said
+    factors = read_sensor(mine).error_factors
+    assert "by hdl64e_small: " in said
+    assert f"new error_factors [{factors[0]:.3f}, {factors[1]:.3f}] in {mine}" in said
+    assert replace(read_sensor(mine), error_factors=None) == SENSORS["hdl64e"].resized(32, 256)
+    once = mine.read_bytes()
+    other = tmp_path / "other.yaml"  # its own file stays where another is given
+    r2flow("calibrate", "simulated:1", "--sensor", mine, *how, "--out", other)
+    assert mine.read_bytes() == once
+    assert read_sensor(other).error_factors == factors

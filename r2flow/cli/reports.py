@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from typer import Argument, Option
 
 from r2flow.base.devices import choose_device
+from r2flow.base.errors import check
 from r2flow.base.files import check_folder
 from r2flow.cli.app import app, report
 from r2flow.cli.options import (
@@ -228,7 +229,11 @@ def compare(
 @app.command(rich_help_panel="Draw", epilog="Example: r2flow calibrate my/scans --sensor mine.yaml")
 def calibrate(
     real: Annotated[str, Argument(help=f"A few whole scans: {SETS}.")],
-    sensor: Annotated[Path, Option(help="YAML file of their sensor: the factors go into it.")],
+    sensor: Annotated[str, Option(help="Their sensor: a YAML file, or a name with --out.")],
+    out: Annotated[
+        Path | None,
+        Option("--out", "-o", help="YAML file for the factors. Default: that of the sensor."),
+    ] = None,
     model: Annotated[
         str, Option("--checkpoint", "-c", help="The model whose errors are compared.")
     ] = "densify",
@@ -239,13 +244,17 @@ def calibrate(
     """Improve the errors of added points for your own sensor: rows of its scans are hidden, and
     the factors that hold the truth are written into its file.
     """
+    from r2flow.lidar.sensors import ENDINGS
     from r2flow.model.checkpoint import load_checkpoint
     from r2flow.reports.calibration import calibrate as calibrate_sensor
 
+    file = out or Path(sensor)
+    is_yaml = file.suffix.lower() in ENDINGS
+    check(is_yaml, f"{file} is no file that takes the factors: give --out {file.stem}_mine.yaml.")
     flow = load_checkpoint(model, choose_device(device))
-    trust = calibrate_sensor(flow, real, sensor, num, reflectance_scale)
+    trust = calibrate_sensor(flow, real, sensor, file, num, reflectance_scale)
     (first, second), (near, far) = trust.factors, trust.shares
     print(
-        f"{trust.points:,} added points: {near:.1%} within error_68, {far:.1%} within error_95 so "
-        f"far; error_factors [{first:.3f}, {second:.3f}] in {sensor}"
+        f"{trust.points:,} added points by {sensor}: {near:.1%} within error_68, {far:.1%} within "
+        f"error_95; new error_factors [{first:.3f}, {second:.3f}] in {file}"
     )

@@ -15,7 +15,7 @@ from r2flow.base.progress import Bar
 from r2flow.generators import TransferFlow
 from r2flow.generators.base import Progress
 from r2flow.lidar.known import ray_states
-from r2flow.lidar.sensors import read_sensor, write_sensor
+from r2flow.lidar.sensors import named_sensor, write_sensor
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import complete
 from r2flow.model.inversion import real_scans
@@ -42,23 +42,24 @@ class Trust(NamedTuple):
 def calibrate(
     model: Checkpoint,
     real: str,
-    sensor: Path,
+    sensor: str,
+    out: Path,
     num: int = 16,
     reflectance_scale: float | None = None,
 ) -> Trust:
-    """Write the factors of `trust_of` on at most `num` scans into the YAML file of their sensor,
-    which keeps its comment.
+    """Write the sensor of scans, by name or YAML file, with the factors of `trust_of` on at most
+    `num` of them. A file that is there keeps its comment.
     """
-    plain = read_sensor(sensor)
+    plain = named_sensor(sensor)
     flow = model.through(plain)
     _, images = real_scans(flow, [real], reflectance_scale, num, need_reflectance=False)
     with Bar("completing", len(images) * len(TASKS), "evaluations") as advance:
         trust = trust_of(flow, [*images.numpy()], advance)
-    lines = sensor.read_text(encoding="utf-8").splitlines()
+    lines = out.read_text(encoding="utf-8").splitlines() if out.exists() else []
     said = [line for line in lines if line.startswith("#") and "error_factors" not in line]
     about = f"error_factors: r2flow calibrate, {title_of(model.path)}, {len(images)} scans"
     comment = "\n".join(line.removeprefix("#").strip() for line in [*said[:-1], about])
-    write_sensor(replace(plain, error_factors=trust.factors), sensor, comment)
+    write_sensor(replace(plain, error_factors=trust.factors), out, comment)
     return trust
 
 
