@@ -25,6 +25,7 @@ from r2flow.lidar.scan_files import (
     NoPointsError,
     Points,
     points_beside,
+    read_cloud,
     read_points,
     read_range_image,
 )
@@ -160,6 +161,25 @@ def read_labelled_scan(
     labels = read_labels(file, path, projected.points, ids)[projected.numbers]
     semantic = scatter(reading.sensor, projected.pixels, [labels])[0]
     return projected.image, semantic.astype(np.uint16)
+
+
+def read_errors(path: Path, reading: Reading) -> np.ndarray | None:
+    """`error_68` of the point of each pixel of a completed scan, metres, (1, H, W) float32: 0 of a
+    measured one and without return, NaN of an added one without error; None for other scans.
+    """
+    if read_range_image(path) is not None:
+        return None
+    cloud = read_cloud(path, reading.columns)
+    measured = cloud.column("measured")
+    if measured is None:
+        return None
+    errors = cloud.column("error_68")
+    if errors is None:
+        errors = np.where(measured, 0, np.nan)
+    projected = _project_file(path, reading)
+    if projected.points.kept is not None:
+        errors = errors[projected.points.kept]
+    return scatter(reading.sensor, projected.pixels, [errors[projected.numbers]])
 
 
 def _as_read(path: Path, image: np.ndarray, reading: Reading) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Pictures and 3-D pages of completed scans."""
 
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -45,16 +46,21 @@ def draw_answers(
     ids: list[np.ndarray | None] = [None] * len(images)
     if answers.shape[1] > 2:
         ids = [semantic_ids(image[2]) if len(image) > 2 else None for image in images]
-    elif completed.densities:
-        errors = completed.error(0.68)[0, : len(answers)].numpy()
-        ids[: 1 + len(answers)] = map(trust_ids, images, [np.zeros_like(errors[0]), *errors])
+    unmeasured = known.state == Ray.UNKNOWN
+    errors = [np.where(unmeasured, np.nan, 0), *completed.error(0.68)[0, : len(answers)].numpy()]
     images = [image[: min(len(known.image), 2)] for image in images]
     panels = [
-        Panel(caption, image[None], rays, None if one is None else one[None])
-        for caption, image, one in zip(names, images, ids, strict=True)
+        Panel(
+            caption,
+            image[None],
+            rays,
+            None if one is None else one[None],
+            errors=None if error is None else error[None],
+        )
+        for caption, image, one, error in zip_longest(names, images, ids, errors)
     ]
     write_viewer(out / f"{name}.html", panels, title)
-    if completed.densities:
-        ids[0] = None  # all of it was measured
-    figure = contact_sheet(images, rays, names, known.state == Ray.UNKNOWN, ids)
+    if completed.densities and answers.shape[1] < 3:
+        ids[1 : len(errors)] = map(trust_ids, answers, errors[1:])
+    figure = contact_sheet(images, rays, names, unmeasured, ids)
     save_figure(figure, out / f"{name}.png")

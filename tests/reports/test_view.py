@@ -15,7 +15,8 @@ from r2flow import load
 from r2flow.base.errors import InputError
 from r2flow.lidar.labels import CLASSES
 from r2flow.lidar.projection import image_to_points
-from r2flow.lidar.scan_files import write_points
+from r2flow.lidar.scan_files import write_cloud, write_points
+from r2flow.lidar.scan_files.cloud import Cloud
 from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.view import MOST, Panel, page
 from r2flow.simulator import simulate
@@ -110,11 +111,25 @@ def test_labels_have_their_names_and_colours():
     ]
     data = Parsed(page(panels)).data
     assert [one["labels"] for one in data["scans"]] == [True, False]
-    assert data["shown"] == {"reflectance": False, "label": True}
+    assert [one["reflectance"] for one in data["scans"]] == [False, False]
     _, numbers = unpacked(data, 0)
     assert data["classes"][numbers[0, 0]] == list(CLASSES[10])
     assert data["classes"][numbers[4, 0]] == list(CLASSES[40])
     assert data["classes"][numbers[7, 0]][0] == "no class"
+
+
+ERRORS = np.full(SENSOR.shape, 0.3)
+ERRORS[0, :6] = 0, 0.01, 0.2, 0.21, 7, np.nan
+
+
+def test_errors_are_stored_as_the_step_of_the_slider_that_they_need():
+    data = Parsed(page([Panel("scan", images(1), RAYS, errors=ERRORS[None])])).data
+    steps = data["trust"]["steps"]
+    *_, numbers = unpacked(data, 0)
+    assert numbers[0, 0] == 0
+    assert [steps[number - 1] for number in numbers[0, 1:4]] == [0.02, 0.2, 0.3]
+    assert (numbers[0, 4:6] - len(steps)).tolist() == [1, 2]
+    assert steps[numbers[1, 0] - 1] == 0.3
 
 
 def test_a_usual_scan_takes_about_130_kb():
@@ -209,6 +224,20 @@ class TestTheVerb:
         assert r2flow("view", *scans, "-o", tmp_path / "a.html")[0] == 0
         data = Parsed((tmp_path / "a.html").read_text()).data
         assert [one["caption"] for one in data["scans"]] == ["a/data/0.ply", "b/data/0.ply"]
+
+    @pytest.mark.parametrize("ending", ["pcd", "bin"])
+    def test_reads_the_predicted_errors_of_a_completed_scan(self, r2flow, tmp_path, ending):
+        image = np.stack([np.full(SENSOR.shape, 10), np.nan_to_num(ERRORS)]).astype(np.float32)
+        xyz, errors = image_to_points(image, RAYS)
+        x, errors = np.insert(xyz, 0, np.nan, axis=0).T, np.insert(errors, 0, 9)  # a lost ray first
+        cloud = Cloud(("x", "y", "z", "i"), (*x, 0 * errors), held=4)
+        fields = {"measured": (errors == 0).astype("u1"), "error_68": errors}
+        write_cloud(tmp_path / f"a.{ending}", cloud.with_fields(fields))
+        assert r2flow("view", tmp_path, "--size", "8x32", "-o", tmp_path / "a.html")[0] == 0
+        data = Parsed((tmp_path / "a.html").read_text()).data
+        *_, numbers = unpacked(data, 0)
+        limits = np.array([0, *data["trust"]["steps"]])
+        assert np.array_equal(numbers, (image[1][..., None] > limits).sum(-1))
 
     def test_a_sequence_is_one_scan_with_frames(self, r2flow, tmp_path, monkeypatch):
         monkeypatch.setenv("HOME", str(tmp_path))

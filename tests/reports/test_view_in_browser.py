@@ -29,9 +29,13 @@ def lone(scale: float = 1.0) -> np.ndarray:
 
 
 def panel(
-    *images: np.ndarray, caption: str = "scan", labels: np.ndarray | None = None, frames=()
+    *images: np.ndarray,
+    caption: str = "scan",
+    labels: np.ndarray | None = None,
+    frames=(),
+    errors=None,
 ) -> Panel:
-    return Panel(caption, np.stack(images), RAYS, labels, frames)
+    return Panel(caption, np.stack(images), RAYS, labels, frames, errors)
 
 
 @pytest.fixture(scope="module")
@@ -59,9 +63,9 @@ def opened(chromium, tmp_path):
     """Opens the page of some panels; no error of its own, no request but for itself."""
     contexts, errors, requests = [], [], []
 
-    def open(*panels, size=DESKTOP):
+    def open(*panels, size=DESKTOP, title="r2flow"):
         path = tmp_path / "page.html"
-        path.write_text(page(panels), encoding="utf-8")
+        path.write_text(page(panels, title), encoding="utf-8")
         contexts.append(chromium.new_context(viewport=size, color_scheme="dark"))
         shown = contexts[-1].new_page()
         shown.on("pageerror", lambda error: errors.append(str(error)))
@@ -277,6 +281,138 @@ def test_only_what_is_there_can_be_coloured(opened):
     box, point = shown.locator(".points").bounding_box(), points_of(lone())[6, 35]
     x, y = projected(point, camera_of(shown), box)
     assert np.abs(screen(shown)[round(y - 0.5), round(x - 0.5)] - [0x9A, 0x86, 0xC9]).max() <= 4
+
+
+# Of `PIXELS` by their predicted error, the first measured; the colours are those of the pictures.
+ERRORS = dict(zip(PIXELS, (0, 0.04, 0.15, 0.7, 3), strict=True))
+HUES = ("#74c0fc", "#2f9e44", "#fcc419", "#f76707", "#c92a2a")
+
+
+def completed() -> list[Panel]:
+    """The measured point alone, and with the others, all other rays measured but one."""
+    errors = np.zeros((1, *SENSOR.shape))
+    errors[0, *zip(*PIXELS, strict=True)] = [*ERRORS.values()]
+    own = lone() * (errors == 0)
+    unknown = np.where(errors > 0, np.nan, 0)
+    return [panel(own, caption="own", errors=unknown), panel(lone(), caption="all", errors=errors)]
+
+
+def seen(shown, tile: int = -1) -> list[bool]:
+    """Which of `PIXELS` are drawn in a panel in the colour of their error."""
+    pixels, box = screen(shown), shown.locator(".points").nth(tile).bounding_box()
+    places = [projected(at, camera_of(shown), box) for at in points_of(lone()).values()]
+    found = [pixels[round(y - 0.5), round(x - 0.5)] for x, y in places]
+    hues = [[int(hue[i : i + 2], 16) for i in (1, 3, 5)] for hue in HUES]
+    return [np.abs(at - hue).max() <= 4 for at, hue in zip(found, hues, strict=True)]
+
+
+def test_points_are_hidden_by_kind_and_by_their_predicted_error(opened):
+    shown = opened(*completed())
+    assert shown.locator("#modes [aria-pressed=true]").inner_text() == "height"
+    for key in ("t", "g"):  # from above without rings
+        shown.keyboard.press(key)
+    colour_by(shown, "predicted error")
+    assert seen(shown) == [True] * 5
+    assert seen(shown, 0) == [True] + [False] * 4
+    slider = shown.locator("#error")
+    slider.fill("5")  # the sixth step, 0.2 m
+    settle(shown)
+    assert seen(shown) == [True, True, True, False, False]
+    said = "0.2 m: 50 % of 4 added points are shown"
+    assert slider.get_attribute("aria-valuetext") == said
+    shown.locator("figcaption button").first.click()  # alone and back
+    shown.keyboard.press("Escape")
+    settle(shown)
+    shown.keyboard.press("e")  # 0.15 m
+    shown.keyboard.press("m")
+    settle(shown)
+    assert seen(shown) == [False, True, True, False, False]
+    assert seen(shown, 0) == [False] * 5
+    assert shown.locator("#measured").get_attribute("aria-pressed") == "false"
+    for _ in range(6):
+        shown.keyboard.press("Shift+E")
+    shown.locator("#measured").click()
+    settle(shown)
+    assert seen(shown) == [True] * 5
+    assert shown.locator("#kept").inner_text() == "any: 100 %"
+    shown.keyboard.press("a")
+    settle(shown)
+    assert seen(shown) == [True] + [False] * 4
+    strip = shown.locator(".image").last.bounding_box()
+    shown.mouse.move(
+        strip["x"] + 35.5 / 64 * strip["width"], strip["y"] + 6.5 / 16 * strip["height"]
+    )
+    assert shown.locator("#readout").inner_text().endswith("added, error up to 0.05 m")
+
+
+def test_rays_without_return_and_those_not_measured_differ(opened):
+    shown = opened(*completed())
+    assert shown.locator("#legend span").all_inner_texts()[-2:] == ["not measured", "no return"]
+    strip, pixels = shown.locator(".image").first.bounding_box(), screen(shown)
+    colours = {}
+    for row, column in ((6, 35), (7, 35)):
+        x = strip["x"] + (column + 0.5) / 64 * strip["width"]
+        y = strip["y"] + 1 + (row + 0.5) / 16 * (strip["height"] - 1)
+        colours[row] = pixels[int(y), int(x)].tolist()
+        shown.mouse.move(x, y)
+        said = shown.locator("#readout").inner_text()
+        assert said.endswith("not measured" if row == 6 else "no return")
+    assert colours == {6: [0x4A, 0x55, 0x63], 7: [0, 0, 0]}
+
+
+def test_rings_lie_at_their_metres_on_the_ground(opened):
+    shown = opened(panel(lone()))
+    shown.keyboard.press("t")
+    settle(shown)
+    ground = np.percentile([point[2] for point in points_of(lone()).values()], 2)
+    box, camera, with_rings = (
+        shown.locator(".points").bounding_box(),
+        camera_of(shown),
+        screen(shown),
+    )
+    shown.locator("#rings[aria-pressed=true]").click()
+    settle(shown)
+    differ = (with_rings != screen(shown)).any(-1)
+    # 98 % of the points lie within 30.3 m: up to five rings in steps of 10 m
+    for radius in (10, 20, 30):
+        angles = np.linspace(0, 2 * np.pi, 50)
+        at = [
+            projected(np.array([radius * np.cos(a), radius * np.sin(a), ground]), camera, box)
+            for a in angles
+        ]
+        inside = [
+            (round(y), round(x)) for x, y in at if box["y"] + 5 < y < box["y"] + box["height"] - 5
+        ]
+        assert len(inside) > 15
+        hits = [differ[y - 2 : y + 3, x - 2 : x + 3].any() for y, x in inside]
+        assert np.mean(hits) == 1
+    assert shown.locator(".ring").all_inner_texts() == ["10 m", "20 m", "30 m"]
+    assert shown.locator(".ring:visible").count() == 0
+
+
+def test_labels_come_first_where_most_scans_have_some(opened):
+    labels = np.full((1, *SENSOR.shape), 40)
+    shown = opened(panel(lone()), panel(lone(), labels=labels), panel(lone()))
+    assert shown.locator("#modes [aria-pressed=true]").inner_text() == "height"
+    colour_by(shown, "label")
+    assert shown.locator("figcaption small").all_inner_texts() == ["no label", "", "no label"]
+    shown = opened(panel(lone()), panel(lone(), labels=labels))
+    assert shown.locator("#modes [aria-pressed=true]").inner_text() == "label"
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_title_and_controls_of_a_completed_scan_are_not_cut(opened, size):
+    title = "000000, at hidden rays: mean error 0.983 m, best interpolation (linear, 1/r) 1.249 m"
+    shown = opened(*completed(), size=size, title=title)
+    sizes = shown.evaluate(
+        "() => { const h = document.querySelector('h1'); "
+        "return [h.scrollWidth - h.clientWidth, h.scrollHeight - h.clientHeight]; }"
+    )
+    assert max(sizes) <= 0
+    for one in shown.locator("button:visible, input:visible, output:visible").all():
+        box = one.bounding_box()
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= size["width"]
 
 
 @pytest.mark.parametrize(("size", "count"), [(DESKTOP, 16), (PHONE, 6)])

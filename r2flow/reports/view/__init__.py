@@ -26,12 +26,27 @@ from torch import Tensor
 from r2flow.base.errors import InputError, printable
 from r2flow.base.files import write_file
 from r2flow.lidar.labels import semantic_ids
-from r2flow.reports.pictures import TRUST, TRUST_TITLE, class_colours, colours, view_of
+from r2flow.reports.pictures import (
+    TRUST,
+    TRUST_LIMITS,
+    TRUST_TITLE,
+    class_colours,
+    colours,
+    view_of,
+)
 
 MOST = 256 * 64 * 1024  # maximum pixels of all images of a page: about 33 MB
 STEP = 0.004  # metres per range code: uint16 reaches 262 m with errors of at most 2 mm
 _CODES = 2**16
 _SCALES = ("range", "height", "reflectance")  # in the order of `view.js`
+_STEPS = (0.02, 0.03, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0)  # of the page's slider, metres
+#: How a page names and colours points by their predicted error.
+TRUST_SCALE = {
+    "title": TRUST_TITLE,
+    "steps": _STEPS,
+    "limits": TRUST_LIMITS,
+    "classes": [*TRUST.values()],
+}
 
 
 class Panel(NamedTuple):
@@ -42,6 +57,8 @@ class Panel(NamedTuple):
     rays: Tensor  # elevation and azimuth in radians, (2, H, W)
     labels: ndarray | None = None  # semantic ids, (T, H, W)
     frames: Sequence[str] = ()  # slider captions
+    # `error_68` of added points, metres; 0 of measured rays, NaN of others without one, (T, H, W)
+    errors: ndarray | None = None
 
 
 def panel_of(caption: str, images: ndarray, rays: Tensor, frames: Sequence[str] = ()) -> Panel:
@@ -96,8 +113,7 @@ def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
             "images with "
             f"{pixels:,}. Take fewer scans or frames (--num)."
         )
-    sensors: dict[bytes, int] = {}
-    described = []
+    sensors: dict[bytes, dict[str, Any]] = {}
     labelled = [panel.labels[panel.labels > 0] for panel in panels if panel.labels is not None]
     classes = class_colours(np.concatenate(labelled), most=255) if labelled else {}
     farthest = max(np.nan_to_num(panel.images[:, 0], posinf=0).max() for panel in panels)
@@ -106,41 +122,38 @@ def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
     for panel in panels:
         angles = np.asarray(panel.rays, dtype=np.float64)
         key = angles.tobytes()
-        if key not in sensors:
-            sensors[key] = len(sensors)
-            described.append(described_rays(angles))
-        classified: Any = [None] * len(panel.images)
+        sensors[key] = described_rays(angles)
+        planes = []
         if panel.labels is not None:
-            classified = _class_numbers(panel.labels, classes)
+            planes.append(_class_numbers(panel.labels, classes))
+        if panel.errors is not None:
+            # 0 of measured rays, then the step that an error needs, then one more, and NaN last
+            numbers = np.searchsorted((0, *_STEPS, np.inf), panel.errors)
+            planes.append(numbers.astype(np.uint8))
         scans.append(
             {
                 "caption": printable(panel.caption),
-                "rays": sensors[key],
+                "rays": list(sensors).index(key),
                 "frames": [
-                    _packed_image(image, step, numbers)
-                    for image, numbers in zip(panel.images, classified, strict=True)
+                    _packed_image(image, step, *numbers)
+                    for image, *numbers in zip(panel.images, *planes, strict=True)
                 ],
                 "reflectance": panel.images.shape[1] > 1,
                 "labels": panel.labels is not None,
+                "errors": panel.errors is not None,
             }
         )
-    trusted = classes.keys() & TRUST.keys()
     view = view_of(*((panel.images[0], panel.rays) for panel in panels))
     return {
         "scans": scans,
-        "rays": described,
+        "rays": list(sensors.values()),
         "frames": [printable(frame) for frame in max((p.frames for p in panels), key=len)],
         "metres": step,
         "ranges": view.ranges,
         "heights": view.heights,
         "colours": colour_table(),
-        "classes": [("none predicted" if trusted else "no class", "#808080"), *classes.values()],
-        "kind": TRUST_TITLE if trusted else "label",
-        "legend": list(dict(classes.values()).items()),
-        "shown": {
-            "reflectance": any(scan["reflectance"] for scan in scans),
-            "label": bool(labelled),
-        },
+        "classes": [("no class", "#808080"), *classes.values()],
+        "trust": TRUST_SCALE,
     }
 
 
@@ -161,11 +174,12 @@ def most_images(shape: Sequence[int]) -> int:
     return MOST // int(np.prod(shape[-2:]))
 
 
-def _packed_image(image: ndarray, step: float, numbers: ndarray | None = None) -> str:
+def _packed_image(image: ndarray, step: float, *numbers: ndarray) -> str:
     """Encode an image, (2 or 1, H, W), as byte planes of H W each, compressed by zlib, in base64.
 
     Planes: high and low bytes of range codes, as differences along each row modulo 2^16; optionally
-    reflectance in 255 levels; optionally class numbers. Code c means c `step` metres, 0 no return.
+    reflectance in 255 levels; `numbers` of classes and errors. Code c means c `step` metres, 0 no
+    return.
     """
     r = np.nan_to_num(image[0].astype(np.float64), posinf=0, neginf=0)
     codes = np.where(r > 0, np.clip(np.rint(r / step), 1, _CODES - 1), 0).astype(np.int32)
@@ -173,8 +187,7 @@ def _packed_image(image: ndarray, step: float, numbers: ndarray | None = None) -
     planes = [differences.view(np.uint8).reshape(-1, 2).T.tobytes()]
     if len(image) > 1:
         planes.append(np.rint(255 * np.nan_to_num(image[1]).clip(0, 1)).astype(np.uint8).tobytes())
-    if numbers is not None:
-        planes.append(numbers.astype(np.uint8).tobytes())
+    planes += [plane.tobytes() for plane in numbers]
     return _base64(zlib.compress(b"".join(planes), 6))
 
 

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from numpy import ndarray
 
-from r2flow.base.errors import InputError
+from r2flow.base.errors import check
 from r2flow.base.progress import Bar
 from r2flow.data.described import Described
 from r2flow.data.files import ScanFiles
 from r2flow.data.opening import open_each, open_scans
 from r2flow.data.options import FOLDER, SIMULATED
-from r2flow.data.reading import Reading, read_labelled_scan
+from r2flow.data.reading import Reading, read_errors, read_labelled_scan
 from r2flow.data.reflectance import estimated_scale
 from r2flow.data.sensor_checks import readable, warn_of_other_sensor
 from r2flow.data.sets import ScanSet
@@ -72,7 +72,10 @@ def scan_panels(
     for (scans, _, opened, number), caption in zip(views, captions, strict=True):
         image = opened.source[number]
         classes = _read_labels(opened.source, number)
-        yield scans, Panel(caption, image[None], opened.sensor.rays(), classes)
+        errors = None
+        if isinstance(opened.source, ScanFiles):
+            errors = read_errors(Path(opened.source.paths[number]), opened.source.reading)
+        yield scans, Panel(caption, image[None], opened.sensor.rays(), classes, errors=errors)
 
 
 def _read_labels(source: ScanSource, number: int) -> ndarray | None:
@@ -92,18 +95,16 @@ def _read_labels(source: ScanSource, number: int) -> ndarray | None:
 
 def as_frames(panels: Sequence[Panel], caption: str) -> Panel:
     """Combine panels as frames of one."""
-    captions, images, rays, classes, _ = zip(*panels, strict=True)
-    for panel in panels[1:]:
-        same_labels = (panel.labels is None) == (classes[0] is None)
-        same_image = panel.images.shape == images[0].shape and torch.equal(panel.rays, rays[0])
-        if not (same_labels and same_image):
-            raise InputError(
-                f"{panel.caption} and {captions[0]} differ in size, sensor, reflectance or labels: "
-                "they cannot be "
-                "frames of one sequence; leave --sequence out."
-            )
-    numbers = None if classes[0] is None else np.concatenate(classes)
-    return Panel(caption, np.concatenate(images), rays[0], numbers, captions)
+    captions, images, rays, classes, _, errors = zip(*panels, strict=True)
+    for panel in panels:
+        kinds = {(x.images.shape, x.labels is None, x.errors is None) for x in (panel, panels[0])}
+        check(
+            len(kinds) == 1 and torch.equal(panel.rays, rays[0]),
+            f"{panel.caption} and {captions[0]} differ in size, sensor, reflectance, labels or "
+            "predicted errors: they cannot be frames of one sequence; leave --sequence out.",
+        )
+    joined = [None if x[0] is None else np.concatenate(x) for x in (classes, errors)]
+    return Panel(caption, np.concatenate(images), rays[0], joined[0], captions, joined[1])
 
 
 def sample_panels(

@@ -4,16 +4,27 @@
 const page = JSON.parse(document.getElementById("data").textContent);
 const element = (id) => document.getElementById(id);
 const tiles = element("tiles");
-const MODES = ["range", "height", "reflectance", "label"].filter(
-  (mode) => !(mode in page.shown) || page.shown[mode],
-);
+const SCALES = ["range", "height", "reflectance", "label", "error"];
+const PARTS = { reflectance: "reflectance", label: "labels", error: "errors" }; // of scans, which modes need
+const MODES = SCALES.filter((mode) => !PARTS[mode] || page.scans.some((scan) => scan[PARTS[mode]]));
+const STEPS = page.trust.steps; // of the slider, in metres; after the last, all added points are shown
+// Names and colours of errors by their number: measured, a step each, more, none.
+const ERRORS = [
+  page.trust.classes[0],
+  ...[...STEPS, Infinity].map((step) => page.trust.classes[1 + page.trust.limits.filter((limit) => limit < step).length]),
+  ["none predicted", "#808080"],
+];
+const UNMEASURED = "#4a5563"; // rays of the image that were not measured
 const MOST_TILES = 16; // on screen
 const SLOW = 90; // milliseconds per frame above which a moving camera draws fewer points
 const COARSE = 5; // draw every n-th point; not a divisor of usual numbers of columns, to avoid stripes
 
-const nameOf = (mode) => (mode === "label" ? page.kind : mode);
+const nameOf = (mode) => (mode === "error" ? "predicted error" : mode);
 
-const state = { mode: page.shown.label && page.kind === "label" ? "label" : "height", size: 0, frame: 0, first: 0, alone: null, picked: null, playing: false };
+const state = {
+  mode: 2 * page.scans.filter((scan) => scan.labels).length >= page.scans.length ? "label" : "height", size: 0, rings: true,
+  measured: true, added: true, most: STEPS.length, frame: 0, first: 0, alone: null, picked: null, playing: false,
+};
 const camera = { target: [0, 0, 0], yaw: Math.PI, pitch: 0.42, distance: 30 };
 
 
@@ -40,7 +51,7 @@ function directionsOf(rays) {
   return found;
 }
 
-/** Range code, reflectance, class and padding of each pixel, (H W, 4); layout as in Python's `packed_image`. */
+/** Range code, reflectance, class and error of each pixel, (H W, 4); layout as in Python's `packed_image`. */
 function texelsOf(bytes, scan, rays) {
   const { rows, columns } = rays;
   const pixels = rows * columns;
@@ -48,12 +59,14 @@ function texelsOf(bytes, scan, rays) {
   let planes = 2;
   const reflectance = scan.reflectance ? planes++ : 0;
   const label = scan.labels ? planes++ : 0;
+  const error = scan.errors ? planes++ : 0;
   for (let i = 0, code = 0; i < pixels; i++) {
     if (i % columns === 0) code = 0;
     code = (code + 256 * bytes[i] + bytes[pixels + i]) & 65535; // differences along a row
     texels[4 * i] = code;
     if (reflectance) texels[4 * i + 1] = bytes[reflectance * pixels + i];
     if (label) texels[4 * i + 2] = bytes[label * pixels + i];
+    texels[4 * i + 3] = error ? bytes[error * pixels + i] : ERRORS.length - 1;
   }
   return texels;
 }
@@ -68,6 +81,8 @@ function load(scan, frame) {
     made.ready = inflate(packed).then((bytes) => {
       const rays = page.rays[scan.rays];
       made.texels = texelsOf(bytes, scan, rays);
+      made.points = new Uint32Array(ERRORS.length); // by the number of their error
+      for (let i = 0; i < made.texels.length; i += 4) if (scan.errors && made.texels[i]) made.points[made.texels[i + 3]]++;
       made.texture = texture(gl.RGBA16UI, rays.columns, rays.rows, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT, made.texels);
     });
     loading.set(packed, made);
@@ -78,23 +93,34 @@ function load(scan, frame) {
 const frameOf = (scan) => Math.min(state.frame, scan.frames.length - 1);
 const current = (scan) => load(scan, frameOf(scan));
 
+/** Number up to which errors are shown. */
+const most = () => (state.most < STEPS.length ? state.most + 1 : ERRORS.length);
+
+/** Whether points of this number of an error are not shown. */
+const isHidden = (scan, number) => scan.errors && (number ? !state.added || number > most() : !state.measured);
+
 
 // Shaders
 
 const COMMON = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D; precision highp sampler2D;
-uniform usampler2D scan;      // range code, reflectance, class
+uniform usampler2D scan;      // range code, reflectance, class, error
 uniform sampler2D directions;
 uniform sampler2D colours;    // one row per mode
 uniform float metres;         // per range code
 uniform vec2 ranges, heights; // limits of the colour scales
 uniform int mode;
+uniform bool errors, measured, added; // has errors; shows measured and added points
+uniform int most;                     // number up to which errors are shown
+bool is_hidden(uvec4 texel) {
+  return errors && (texel.a == 0u ? !measured : !added || int(texel.a) > most);
+}
 vec3 colour_of(uvec4 texel, float height) {
   float r = float(texel.r) * metres;
   float place = mode == 0 ? log(r / ranges.x) / log(ranges.y / ranges.x)
     : mode == 1 ? (height - heights.x) / (heights.y - heights.x)
     : sqrt(float(texel.g) / 255.0) / 0.9;
-  int number = mode == 3 ? int(texel.b) : int(clamp(place * 256.0, 0.0, 255.0));
+  int number = mode == 3 ? int(texel.b) : mode == 4 ? int(texel.a) : int(clamp(place * 256.0, 0.0, 255.0));
   return texelFetch(colours, ivec2(number, mode), 0).rgb;
 }
 `;
@@ -114,8 +140,8 @@ void main() {
   float r = float(texel.r) * metres;
   vec3 point = r * texelFetch(directions, pixel, 0).xyz;
   gl_Position = camera * vec4(point, 1.0);
-  if (texel.r == 0u) gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // outside: no return
-  gl_PointSize = clamp(factor * r * spacing * scale / gl_Position.w, least, 9.0 * least);
+  if (texel.r == 0u || is_hidden(texel)) gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // outside
+  gl_PointSize = clamp(factor * r * spacing * scale / gl_Position.w, least, 6.0 * least);
   colour = colour_of(texel, point.z);
 }`, COMMON + `
 in vec3 colour;
@@ -152,8 +178,20 @@ void main() {
   shown.rgb *= max(0.25, exp(-5.0 * behind));
 }`];
 
+const RINGS = [`#version 300 es
+uniform mat4 camera;
+uniform float radius, ground;
+void main() {
+  float angle = 6.2831853 * float(gl_VertexID) / 180.0;
+  gl_Position = camera * vec4(radius * cos(angle), radius * sin(angle), ground, 1.0);
+}`, `#version 300 es
+precision highp float;
+out vec4 shown;
+void main() { shown = vec4(0.36, 0.41, 0.47, 1.0); }`];
+
 const IMAGE = [WHOLE, COMMON + `
 uniform vec2 corner, size; // of the image on the screen, in pixels
+uniform vec3 unmeasured;   // colour
 out vec4 shown;
 void main() {
   ivec2 full = textureSize(scan, 0);
@@ -164,9 +202,12 @@ void main() {
   vec3 sum = vec3(0.0);
   for (int column = first; column < last && column < full.x; column++) {
     uvec4 texel = texelFetch(scan, ivec2(column, row), 0);
-    if (texel.r == 0u) continue;
+    if (texel.r == 0u) {
+      if (errors && texel.a != 0u) sum += unmeasured;
+      continue;
+    }
     float z = float(texel.r) * metres * texelFetch(directions, ivec2(column, row), 0).z;
-    sum += colour_of(texel, z);
+    sum += colour_of(texel, z) * (is_hidden(texel) ? 0.25 : 1.0);
   }
   shown = vec4(sum / float(last - first), 1.0);
 }`];
@@ -282,7 +323,16 @@ function top() {
   moved();
 }
 
+const ground = page.heights[0] + 0.5; // height of the rings: that below which 2 % of the points lie
 let home = 30; // default distance of the camera in metres
+
+let radii = []; // of the rings, in metres: up to five, in steps of 1, 2, 5, 10, 20 or 50
+
+function findRings() {
+  const reach = page.ranges[1] / 1.1;
+  const step = [1, 2, 5, 10, 20].find((metres) => reach / metres < 6) ?? 50;
+  radii = Array.from({ length: Math.max(1, Math.floor(reach / step)) }, (_, i) => step * (i + 1));
+}
 
 /** Set the default distance by the median range of the first scan. */
 function findHome() {
@@ -294,7 +344,7 @@ function findHome() {
 
 // Drawing
 
-let points, light, image, colours, into;
+let points, light, rings, image, colours, into;
 let asked = false;
 let moving = false;
 let late = 0; // consecutive slow frames while the camera moved
@@ -363,6 +413,18 @@ function draw(now) {
     gl.uniform1i(points.places.stride, stride);
     gl.drawArrays(gl.POINTS, 0, Math.floor((rays.rows * rays.columns) / stride));
   }
+  gl.useProgram(rings.made);
+  gl.uniform1f(rings.places.ground, ground);
+  for (const scan of state.rings ? seen : []) {
+    const box = rectangle(scan.points, ratio);
+    gl.viewport(...box);
+    gl.scissor(...box);
+    gl.uniformMatrix4fv(rings.places.camera, false, lens(box[2], box[3]).matrix);
+    for (const radius of radii) {
+      gl.uniform1f(rings.places.radius, radius);
+      gl.drawArrays(gl.LINE_LOOP, 0, 180);
+    }
+  }
   gl.disable(gl.DEPTH_TEST);
   gl.bindFramebuffer(gl.FRAMEBUFFER, null);
   begin([0, 0, width, height]);
@@ -385,6 +447,7 @@ function draw(now) {
     const box = rectangle(scan.image, ratio);
     if (!begin(box)) continue;
     bind(image, scan);
+    gl.uniform3f(image.places.unmeasured, ...partsOf(UNMEASURED).map((part) => part / 255));
     gl.uniform2f(image.places.corner, box[0], box[1]);
     gl.uniform2f(image.places.size, box[2], box[3]);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
@@ -414,7 +477,11 @@ function bind({ places }, scan) {
   gl.uniform1f(places.metres, page.metres);
   gl.uniform2f(places.ranges, ...page.ranges);
   gl.uniform2f(places.heights, ...page.heights);
-  gl.uniform1i(places.mode, ["range", "height", "reflectance", "label"].indexOf(state.mode));
+  gl.uniform1i(places.mode, SCALES.indexOf(state.mode));
+  gl.uniform1i(places.measured, state.measured);
+  gl.uniform1i(places.added, state.added);
+  gl.uniform1i(places.most, most());
+  gl.uniform1i(places.errors, scan.errors);
   return rays;
 }
 
@@ -438,7 +505,7 @@ function pickPoint(scan, x, y) {
   const { matrix: m } = lens(width, height);
   let [best, score] = [null, Infinity];
   for (let i = 0; i < texels.length; i += 4) {
-    if (!texels[i]) continue;
+    if (!texels[i] || isHidden(scan, texels[i + 3])) continue;
     const r = texels[i] * page.metres;
     const [px, py, pz] = [r * directions[i], r * directions[i + 1], r * directions[i + 2]];
     const w = m[3] * px + m[7] * py + m[11] * pz + m[15];
@@ -473,12 +540,27 @@ function place() {
     const point = same ? pointOf(scan, picked.pixel) : null;
     const { rows, columns } = page.rays[scan.rays];
     const at = point && project(point, scan.points.clientWidth, scan.points.clientHeight);
-    put(scan.pointMark, at && at.depth > 0 ? at : null);
+    put(scan.pointMark, at && at.depth > 0 && !isHidden(scan, current(scan).texels[4 * picked.pixel + 3]) ? at : null);
+    placeRings(scan);
     const [row, column] = same ? [Math.floor(picked.pixel / columns), picked.pixel % columns] : [0, 0];
     const [width, height] = [scan.image.clientWidth / columns, scan.image.clientHeight / rows];
     put(scan.imageMark, same ? { x: (column + 0.5) * width, y: (row + 0.5) * height } : null);
   }
   element("readout").textContent = picked ? readout(picked) : "";
+}
+
+/** Write the metres of the rings, ahead of the camera and a little to its right, where there is room. */
+function placeRings(scan) {
+  const { clientWidth: width, clientHeight: height } = scan.points;
+  const angle = camera.yaw + Math.PI - 0.5;
+  let last = null;
+  radii.forEach((radius, i) => {
+    const at = project([radius * Math.cos(angle), radius * Math.sin(angle), ground], width, height);
+    const inside = at.depth > 0 && at.x > 16 && at.x < width - 16 && at.y > 8 && at.y < height - 8;
+    const room = inside && (!last || Math.hypot(at.x - last.x, at.y - last.y) > 26);
+    put(scan.rings[i], state.rings && room ? at : null);
+    if (room) last = at;
+  });
 }
 
 function put(mark, at) {
@@ -491,11 +573,19 @@ function readout({ scan, pixel }) {
   const { texels } = current(scan);
   const where = `row ${Math.floor(pixel / columns)}, column ${pixel % columns}`;
   const point = pointOf(scan, pixel);
-  if (!point) return `${where}: no return`;
+  const number = texels[4 * pixel + 3];
+  if (!point) return `${where}: ${scan.errors && number ? "not measured" : "no return"}`;
   const said = [where, `${Math.hypot(...point).toFixed(2)} m`, `height ${point[2].toFixed(2)} m`];
   if (scan.reflectance) said.push(`reflectance ${(texels[4 * pixel + 1] / 255).toFixed(2)}`);
   if (scan.labels) said.push(page.classes[texels[4 * pixel + 2]][0]);
+  if (scan.errors) said.push(number ? `added${errorName(number)}` : "measured");
   return said.join(" · ");
+}
+
+
+function errorName(number) {
+  if (number === ERRORS.length - 1) return "";
+  return number <= STEPS.length ? `, error up to ${STEPS[number - 1]} m` : `, error above ${STEPS.at(-1)} m`;
 }
 
 
@@ -511,6 +601,7 @@ function buildTile(scan) {
   scan.tile = document.createElement("figure");
   const caption = node("figcaption", scan.tile);
   node("span", caption, { textContent: scan.caption, title: scan.caption });
+  scan.note = node("small", caption);
   if (page.scans.length > 1) {
     const button = node("button", caption, { textContent: "⤢", title: "Alone, or beside the others: double click" });
     button.setAttribute("aria-label", `show ${scan.caption} alone, or all`);
@@ -519,6 +610,7 @@ function buildTile(scan) {
   scan.points = node("div", scan.tile, { className: "points" });
   scan.image = node("div", scan.tile, { className: "image" });
   scan.pointMark = node("div", scan.points, { className: "mark", hidden: true });
+  scan.rings = radii.map((radius) => node("div", scan.points, { className: "ring", hidden: true, textContent: `${radius} m` }));
   scan.imageMark = node("div", scan.image, { className: "mark", hidden: true });
   caption.ondblclick = () => showAlone(scan);
   followPoints(scan);
@@ -577,6 +669,7 @@ function turn(by) {
 /** Draw as soon as all visible frames are unpacked. */
 async function show() {
   await Promise.all(shownScans().map((scan) => current(scan).ready));
+  count();
   redraw();
 }
 
@@ -651,6 +744,10 @@ const KEYS = {
   r: ["reset the camera", reset],
   t: ["from above", top],
   c: ["next colour", () => setMode(MODES[(MODES.indexOf(state.mode) + 1) % MODES.length])],
+  m: ["measured points", () => choose({ measured: !state.measured })],
+  a: ["added points", () => choose({ added: !state.added })],
+  e: ["smaller error", () => choose({ most: state.most - 1 }), () => choose({ most: state.most + 1 })],
+  g: ["rings", () => setRings(!state.rings)],
   "[": ["smaller points", () => setSize(state.size - 0.5)],
   "]": ["larger points", () => setSize(state.size + 0.5)],
   " ": ["play", () => play(!state.playing)],
@@ -667,6 +764,8 @@ const HELP = [
   ["drag", "turn"], ["right button, Shift, two fingers", "move"], ["wheel, pinch", "nearer and farther"],
   ["double click", "turn about that point"], ["arrows", "turn; with Shift, move"], ["+ −", "nearer, farther"],
   ["R", "reset the camera"], ["T", "view from above"], ["C", "next colour"], ["[ ]", "point size"],
+  ["G", "rings of distance"],
+  ...(MODES.includes("error") ? [["M, A", "measured, added points on or off"], ["E, Shift+E", "largest predicted error: smaller, larger"]] : []),
   ["Space , .", "play, frame before, next frame"], ["Page up, Page down", "other scans"],
   ["Esc", "all scans again"], ["D", "dark or light"],
 ];
@@ -707,16 +806,20 @@ function setMode(mode) {
   const legend = element("legend");
   legend.replaceChildren();
   const say = (text) => node("span", legend, { textContent: text });
+  const name = ([text, colour]) => {
+    const entry = say("");
+    node("b", entry).style.background = colour;
+    entry.append(text);
+  };
+  for (const scan of page.scans) scan.note.textContent = PARTS[mode] && !scan[PARTS[mode]] ? `no ${nameOf(mode)}` : "";
   if (mode === "label") {
-    const some = page.kind === "label" || page.scans.some((scan) => !scan.labels);
-    const others = some ? [page.classes[0]] : [];
-    for (const [name, colour] of [...page.legend, ...others]) {
-      const entry = say("");
-      node("b", entry).style.background = colour;
-      entry.append(name);
-    }
+    const [none, ...classes] = page.classes;
+    [...new Map(classes), none].forEach(name);
+  } else if (mode === "error") {
+    say(page.trust.title);
+    [...new Map(ERRORS)].forEach(name);
   } else {
-    const row = ["range", "height", "reflectance"].indexOf(mode);
+    const row = SCALES.indexOf(mode);
     const ends = { range: page.ranges, height: page.heights, reflectance: [0, 0.81] }[mode];
     const unit = mode === "reflectance" ? "" : " m";
     const [low, high] = ends;
@@ -733,12 +836,42 @@ function setMode(mode) {
     bar(stops.slice(8));
     say(rounded(high));
   }
+  if (MODES.includes("error")) [["not measured", UNMEASURED], ["no return", "#000000"]].forEach(name);
   redraw();
 }
 
 function setSize(size) {
   state.size = Math.min(Math.max(size, -2), 2);
   element("size").value = state.size;
+  redraw();
+}
+
+/** Which points of completed scans are shown: measured, added, and these up to a step of their error. */
+function choose(change) {
+  Object.assign(state, change);
+  state.most = Math.min(Math.max(state.most, 0), STEPS.length);
+  for (const kind of ["measured", "added"]) element(kind).setAttribute("aria-pressed", state[kind]);
+  element("error").value = state.most;
+  count();
+  redraw();
+}
+
+/** Say how many added points of the scans on screen the slider leaves. */
+function count() {
+  const points = new Uint32Array(ERRORS.length);
+  for (const scan of shownScans()) current(scan).points?.forEach((number, i) => { points[i] += number; });
+  const upTo = (last) => points.slice(1, last + 1).reduce((total, number) => total + number, 0);
+  const share = upTo(most()) / Math.max(upTo(ERRORS.length), 1);
+  const limit = state.most < STEPS.length ? `${STEPS[state.most]} m` : "any";
+  const text = `${limit}: ${Math.round(100 * share)} %`;
+  element("kept").textContent = text;
+  element("kept").title = `${text} of ${upTo(ERRORS.length).toLocaleString("en")} added points are shown`;
+  element("error").setAttribute("aria-valuetext", element("kept").title);
+}
+
+function setRings(on) {
+  state.rings = on;
+  element("rings").setAttribute("aria-pressed", on);
   redraw();
 }
 
@@ -769,6 +902,11 @@ function setTheme(theme) {
 function buildControls() {
   for (const mode of MODES) node("button", element("modes"), { textContent: nameOf(mode), onclick: () => setMode(mode) });
   element("size").oninput = (event) => setSize(Number(event.target.value));
+  element("kinds").hidden = !MODES.includes("error");
+  for (const kind of ["measured", "added"]) element(kind).onclick = () => choose({ [kind]: !state[kind] });
+  element("error").max = STEPS.length;
+  element("error").oninput = (event) => choose({ most: Number(event.target.value) });
+  element("rings").onclick = () => setRings(!state.rings);
   element("reset").onclick = reset;
   element("top").onclick = top;
   element("theme").onclick = KEYS.d[1];
@@ -784,16 +922,17 @@ function buildControls() {
   light.onchange = () => setTheme(light.matches ? "light" : "dark");
 }
 
-const table = new Uint8Array(4 * 256 * 4); // one row of 256 colours per mode
+const table = new Uint8Array(4 * 256 * SCALES.length); // one row of 256 colours per mode
+
+const partsOf = (colour) => [1, 3, 5].map((place) => parseInt(colour.slice(place, place + 2), 16));
 
 function prepare() {
   table.set(bytesOf(page.colours));
-  page.classes.forEach(([, colour], i) => {
-    const parts = [1, 3, 5].map((place) => parseInt(colour.slice(place, place + 2), 16));
-    table.set([...parts, 255], 4 * (3 * 256 + i));
+  [page.classes, ERRORS].forEach((classes, row) => {
+    classes.forEach(([, colour], i) => table.set([...partsOf(colour), 255], 4 * ((3 + row) * 256 + i)));
   });
-  [points, light, image] = [POINTS, LIGHT, IMAGE].map(program);
-  colours = texture(gl.RGBA8, 256, 4, gl.RGBA, gl.UNSIGNED_BYTE, table);
+  [points, light, rings, image] = [POINTS, LIGHT, RINGS, IMAGE].map(program);
+  colours = texture(gl.RGBA8, 256, SCALES.length, gl.RGBA, gl.UNSIGNED_BYTE, table);
   for (const rays of page.rays) {
     rays.directions ??= directionsOf(rays);
     rays.texture = texture(gl.RGBA32F, rays.columns, rays.rows, gl.RGBA, gl.FLOAT, rays.directions);
@@ -810,8 +949,10 @@ async function start() {
     return trouble("This page needs WebGL 2 and a browser of 2023 or later.");
   }
   prepare();
+  findRings();
   page.scans.forEach(buildTile);
   setMode(state.mode);
+  setRings(true);
   canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
   canvas.addEventListener("webglcontextrestored", () => {
     into = null;
@@ -823,6 +964,7 @@ async function start() {
   await current(page.scans[0]).ready;
   findHome();
   await arrange();
+  choose({});
   reset();
   new ResizeObserver(arrange).observe(tiles);
   requestAnimationFrame(() => { document.documentElement.dataset.ready = Math.round(performance.now()); });

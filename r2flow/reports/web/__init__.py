@@ -26,8 +26,15 @@ from r2flow.lidar.projection import image_to_points
 from r2flow.lidar.sensors import Sensor, named_sensor
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion_export import export_completion
-from r2flow.reports.pictures import TRUST, TRUST_LIMITS, TRUST_TITLE
-from r2flow.reports.view import STEP, assets, colour_table, described_rays, digest, document
+from r2flow.reports.view import (
+    STEP,
+    TRUST_SCALE,
+    assets,
+    colour_table,
+    described_rays,
+    digest,
+    document,
+)
 
 SENSORS = ("vlp16", "vlp32c", "hdl32e")  # with fewer beams than the usual view has rows
 _RUNTIME = "onnxruntime-web"
@@ -95,10 +102,8 @@ def _write_page(folder: Path, models: Sequence[dict[str, Any]]) -> None:
         "frames": [],
         "metres": STEP,
         "colours": colour_table(),
-        "classes": [("no return", "#808080"), *TRUST.values()],
-        "legend": [*TRUST.values()],
-        "limits": TRUST_LIMITS,
-        "kind": TRUST_TITLE,
+        "classes": [],
+        "trust": TRUST_SCALE,
     }
     write_file(folder / "models.json", json.dumps({"models": models, "view": view}))
 

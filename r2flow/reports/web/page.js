@@ -66,20 +66,20 @@ async function contents({ model, scan, points, measured, errors }) {
   // Points follow the returns of the image row by row, from azimuth 0 on.
   const turn = 2 * Math.PI;
   const order = rays.azimuths.map((angle, column) => [((angle % turn) + turn) % turn, column]).sort((a, b) => a[0] - b[0]);
-  const classes = new Uint8Array(pixels);
-  const kind = (own, error) => (own ? 1 : 2 + about.view.limits.filter((limit) => limit < error).length);
+  const numbers = new Uint8Array(pixels); // 0 measured, then by the error: as in `r2flow.reports.view`
+  const kind = (own, error) => (own ? 0 : 1 + about.view.trust.steps.filter((step) => step < error).length);
   let next = 0;
   for (let row = 0; row < rays.rows; row++) {
     for (const [, column] of order) {
       const pixel = row * rays.columns + column;
-      if (range[pixel] > 0) classes[pixel] = kind(measured[next], errors[next++]);
+      if (range[pixel] > 0) numbers[pixel] = kind(measured[next], errors[next++]);
     }
   }
-  const own = range.map((r, i) => (classes[i] === 1 ? r : 0));
+  const own = range.map((r, i) => (numbers[i] === 0 ? r : 0));
   const [near, far] = quantiles(range.filter((r) => r > 0), 0.02, 0.98);
   const [low, high] = quantiles(points.filter((_, i) => i % 4 === 2), 0.02, 0.95);
-  const frame = async (ranges) => [await packed(ranges, reflectance, classes, about.view.metres, rays.columns)];
-  const panel = { rays: 0, reflectance: reflectance !== null, labels: true };
+  const frame = async (ranges) => [await packed(ranges, reflectance, numbers, about.view.metres, rays.columns)];
+  const panel = { rays: 0, reflectance: reflectance !== null, labels: false, errors: true };
   return {
     ...about.view,
     scans: [
@@ -89,12 +89,11 @@ async function contents({ model, scan, points, measured, errors }) {
     rays: [rays],
     ranges: rounded([0.9 * near, 1.1 * far]),
     heights: rounded([low - 0.5, high + 0.5]),
-    shown: { reflectance: reflectance !== null, label: true },
   };
 }
 
 /** An image as `r2flow.reports.view` packs it: planes of bytes, compressed by zlib, in base64. */
-async function packed(range, reflectance, classes, metres, columns) {
+async function packed(range, reflectance, numbers, metres, columns) {
   const pixels = range.length;
   const bytes = new Uint8Array(pixels * (3 + (reflectance !== null)));
   let before = 0;
@@ -106,7 +105,7 @@ async function packed(range, reflectance, classes, metres, columns) {
     before = code;
   });
   if (reflectance) bytes.set(reflectance.map((value) => Math.round(255 * value)), 2 * pixels);
-  bytes.set(classes, bytes.length - pixels);
+  bytes.set(numbers, bytes.length - pixels);
   const stream = new Blob([bytes]).stream().pipeThrough(new CompressionStream("deflate"));
   const small = new Uint8Array(await new Response(stream).arrayBuffer());
   let text = "";
