@@ -16,6 +16,7 @@ python benchmarks/calibration.py                           # the table, without 
 python benchmarks/calibration.py --drawn 8                 # truths between the least and greatest answer
 python benchmarks/calibration.py --kept                    # what --max-error keeps, by distance and class
 python benchmarks/calibration.py --own A B                 # B before and after `r2flow calibrate A`
+python benchmarks/calibration.py --models densify --places # HDL-64E: mean and spread over scans
 """
 
 import argparse
@@ -30,7 +31,7 @@ import torch
 from numpy import ndarray
 from torch import Tensor
 
-from benchmarks.real import FILES, TASKS, scans_of
+from benchmarks.real import FILES, TASKS, scans_of, shared
 from r2flow.data.opening import open_scans
 from r2flow.data.reading import Reading, read_image, read_labelled_scan
 from r2flow.generators.calibration import Calibration, fitted
@@ -58,6 +59,12 @@ SIMULATED = {
     "hdl32e": SENSORS["hdl32e"],
 }
 SCANS, SEED, RAYS = 3, 7, 1500
+PLACES = {  # scans of an HDL-64E below the folder `real`, by data set
+    "KITTI-360": "kitti360/data_3d_raw/*/velodyne_points/data/*.bin",
+    "KITTI raw": "raw/*/*/velodyne_points/data/*.bin",
+    "KITTI object": "object/training/velodyne/*.bin",
+    "SemanticKITTI": "odometry/sequences/*/velodyne/*.bin",
+}
 LIMITS = (0.05, 0.1, 0.2, 0.5)  # metres of --max-error
 DISTANCES = ((0, 10), (10, 20), (20, 40), (40, 80))
 KINDS = {name: number for number, name in enumerate(COMMON, 1)}  # classes of the labelled scans
@@ -241,6 +248,7 @@ def main() -> None:
     parser.add_argument("--num", type=int, help="at most so many scans of a sensor")
     parser.add_argument("--drawn", type=int, help="number of drawn answers")
     parser.add_argument("--kept", action="store_true")
+    parser.add_argument("--places", action="store_true")
     parser.add_argument("--own", nargs=2, type=Path, help="scans to calibrate on, scans to judge")
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -252,6 +260,9 @@ def main() -> None:
         model = load_checkpoint(name)
         if args.kept:
             kept_table(name, model)
+            continue
+        if args.places:
+            places_table(name, model)
             continue
         if args.own:
             for line in own_rows(name, *args.own):
@@ -279,6 +290,26 @@ def main() -> None:
     elif lines:
         fifths = ["1st", "2nd", "3rd", "4th", "5th"]
         print_table(lines, ["model", "sensor", "known", "", "68", *fifths, "95", *fifths, "ECE"])
+
+
+def places_table(name: str, model: Checkpoint) -> None:
+    """Percentages of added points within error_68 and error_95, every 4th row known: the mean over
+    the scans of each data set, the lowest and the highest.
+    """
+    reading = scans_of("HDL-64E")[1]
+    flow = model.through(reading.sensor)
+    lines = []
+    for place, pattern in PLACES.items():
+        shares = []
+        for path in sorted(shared().glob(pattern)):
+            case = Case.of(flow, read_image(path, reading), "rows:4")
+            right = case.added & (case.truth[0] > 0)
+            bounds = case.completed.error(0.68, 0.95)[:, 0].numpy()
+            shares.append([100 * (case.errors <= bound)[right].mean() for bound in bounds])
+            print(place, path.name, *(f"{share:.1f}" for share in shares[-1]), flush=True)
+        cells = [f"{x.mean():.1f} ({x.min():.1f} to {x.max():.1f})" for x in np.transpose(shares)]
+        lines.append([name, place, str(len(shares)), *cells])
+    print_table(lines, ["model", "data set", "scans", "68", "95"])
 
 
 def kept_table(name: str, model: Checkpoint) -> None:

@@ -1,6 +1,7 @@
 """Errors of added points, from the density of the range of each ray."""
 
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -12,10 +13,12 @@ from r2flow.generators.answers import NEVER, Answers
 from r2flow.generators.calibration import fitted, mixture
 from r2flow.lidar.known import ray_states
 from r2flow.lidar.sensors import SENSORS, read_sensor, write_sensor
+from r2flow.model.checkpoint import load_checkpoint
 from r2flow.model.completion import complete
 from r2flow.reports.calibration import TASKS, trust_of
 from r2flow.reports.completion import kept_rays
 from r2flow.simulator import simulate
+from tests.conftest import ROOT
 from tests.test_completion import halved, network
 from tests.test_sampling import scans
 
@@ -194,3 +197,22 @@ def test_calibrate_takes_a_sensor_by_name_and_writes_it_to_a_new_file(
     r2flow("calibrate", "simulated:1", "--sensor", mine, *how, "--out", other)
     assert mine.read_bytes() == once
     assert read_sensor(other).error_factors == factors
+
+
+def test_the_example_of_the_page_runs_and_its_share_lies_between_those_of_other_levels(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    image = simulate(SENSORS["hdl64e"], 3, 0).image
+    (points,) = load_checkpoint("densify").points(torch.from_numpy(image)[None])
+    points.astype("<f4").tofile("scan.bin")
+    page = (ROOT / "docs/trust.md").read_text()
+    found = {}
+    exec(re.search(r"^```python\n(.*?)^```", page, re.M | re.S)[1], found)
+    half, most = found["half"], found["most"]
+    assert half.shape == (1, 64, 1024)
+    assert (half[0][found["added"]] < most[0][found["added"]]).all()
+    assert found["p"][0][found["mask"] & (found["truth"] > 0)].eq(1).all()
+    off = (found["r"] - found["truth"]).abs()[found["added"]]
+    below, above = ((off <= one[0][found["added"]]).float().mean() for one in (half, most))
+    assert below < found["share"] < above
