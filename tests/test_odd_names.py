@@ -103,9 +103,14 @@ def test_a_newline_in_a_name_does_not_eat_the_line():
     assert explain_mistake(InputError(of_a_worker)) == r"a\nb.bin is empty."
 
 
-def test_names_in_results_do_not_control_the_terminal():
+@pytest.mark.parametrize(
+    ("terminal", "bold", "end"),
+    [(True, "\033[1m", "\033[0m"), (False, r"\x1b[1m", r"\x1b[0m")],
+)
+def test_names_in_results_do_not_control_the_terminal(monkeypatch, terminal, bold, end):
     raw = io.BytesIO()
+    monkeypatch.setattr(Harmless, "isatty", lambda self: terminal)
     stream = Harmless(raw, "utf-8", line_buffering=True)
     stream.write("a\033]0;title\007b\033[2Jc\x9b5nd\033[1mbold\033[0m ä\t\u202egnp.bin\n")
-    plain = r"a\x1b]0;title\x07b\x1b[2Jc\x9b5nd" + "\033[1mbold\033[0m ä\t\\u202egnp.bin\n"
+    plain = r"a\x1b]0;title\x07b\x1b[2Jc\x9b5nd" + f"{bold}bold{end} ä\t\\u202egnp.bin\n"
     assert raw.getvalue().decode() == plain

@@ -160,9 +160,13 @@ _OBEYED = re.compile(
 
 
 class Harmless(io.TextIOWrapper):
-    """A text stream that escapes control characters, but for line ends and colours."""
+    """A text stream that escapes control characters, but for line ends and, of rich on a terminal,
+    colours.
+    """
 
     def write(self, text: str) -> int:
+        if not self.isatty():
+            text = text.replace("\x1b", r"\x1b")
         return super().write(_OBEYED.sub(lambda found: printable(found[0]), text))
 
 

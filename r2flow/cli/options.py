@@ -2,6 +2,7 @@
 
 import inspect
 import os
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from functools import wraps
@@ -21,8 +22,10 @@ if TYPE_CHECKING:
 
 def _parse_size(text: str) -> tuple[int, int]:
     """Rows and columns of an image size such as 64x1024."""
-    rows, columns = parse_counts(text.lower().replace("x", ","))
-    return rows, columns
+    found = re.fullmatch(r"([1-9]\d*)[x,]([1-9]\d*)", text.lower())
+    if found is None:
+        raise ValueError(f"{text[:40]!r} is not ROWSxCOLUMNS")
+    return int(found[1]), int(found[2])
 
 
 def _parse_columns(text: str) -> tuple[str, ...]:
@@ -31,9 +34,9 @@ def _parse_columns(text: str) -> tuple[str, ...]:
 
 def parse_counts(text: str) -> list[int]:
     """Positive whole numbers separated by commas."""
-    counts = [int(part) for part in text.split(",")]
+    counts = [int(part) if part.isdecimal() else 0 for part in text.split(",")]
     if min(counts) < 1:
-        raise ValueError(text)
+        raise ValueError(f"{text[:40]!r} is not of whole numbers from 1 on")
     return counts
 
 

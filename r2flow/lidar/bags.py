@@ -83,6 +83,7 @@ def open_recording(path: Path) -> Iterator[Recording]:
     Raises:
         InputError: It is missing, damaged or of another format.
     """
+    check(path.exists(), f"{path} does not exist, or is a broken link. Is the path right?")
     with reading_errors(path):
         paths = _files(path)
         for file in filter(Path.is_file, paths):

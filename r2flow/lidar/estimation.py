@@ -82,7 +82,7 @@ def estimate_sensor(scans: Sequence[Points], name: str = "mine") -> Estimate:
 def hangs(scans: Sequence[Points]) -> bool:
     """Whether the ground lies above the sensor, as in scans of one that hangs upside down.
 
-    Then the level with most returns 3 to 20 m away is above, on all sides, with half as many again
+    Then the level with most returns 1 to 20 m away is above, on all sides, with half as many again
     as that below; of tested real scans, the level below has 1.5 times as many.
     """
     xyz = np.concatenate([scan.xyz for scan in scans])
@@ -92,10 +92,10 @@ def hangs(scans: Sequence[Points]) -> bool:
 
 
 def _level(xyz: ndarray) -> tuple[int, int]:
-    """Returns within 0.15 m of the most frequent height below the sensor, 3 to 20 m away, and the
+    """Returns within 0.15 m of the most frequent height below the sensor, 1 to 20 m away, and the
     number of `_MOST_SIDES` azimuth sectors that they lie in.
     """
-    low, frequency, heights = _heights(xyz)
+    low, frequency, heights = _heights(xyz, nearest=1.0)  # a low robot's floor ends at 3 m
     x, y, _ = low[abs(low[:, 2] - heights[frequency.argmax()]) < 0.15].T
     sides = np.floor(np.arctan2(y, x) * (_MOST_SIDES / (2 * np.pi)))
     return len(x), len(np.unique(sides))
@@ -115,10 +115,10 @@ def _height(xyz: ndarray) -> float | None:
     return round(-float(np.median(z[abs(z - ground) < 0.3])), 2)
 
 
-def _heights(xyz: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    """Returns below the sensor, 3 to 20 m away, (M, 3), and how many are near some heights."""
+def _heights(xyz: ndarray, nearest: float = 3.0) -> tuple[ndarray, ndarray, ndarray]:
+    """Returns below the sensor, `nearest` to 20 m away, (M, 3), and how many are near heights."""
     distance = np.hypot(xyz[:, 0], xyz[:, 1])
-    low = xyz[(distance > 3) & (distance < 20) & (xyz[:, 2] < -0.2)]
+    low = xyz[(distance > nearest) & (distance < 20) & (xyz[:, 2] < -0.2)]
     counts, edges = np.histogram(low[:, 2], np.arange(-6, -0.1, 0.1))
     return low, np.convolve(counts, np.ones(3), "same"), edges[:-1] + 0.05
 
