@@ -1,9 +1,11 @@
 """r2flow complete: as a user types it."""
 
 import json
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,13 +19,14 @@ from r2flow.data.partial import open_partial
 from r2flow.data.reading import Reading
 from r2flow.lidar.interpolation import interpolated
 from r2flow.lidar.known import Ray, parse_mask
-from r2flow.lidar.other_sensors import image_through
+from r2flow.lidar.other_sensors import Partial, image_through
 from r2flow.lidar.projection import image_to_points, project
 from r2flow.lidar.scan_files import read_points, write_points
 from r2flow.lidar.sensors import SENSORS, write_sensor
 from r2flow.model import checkpoint
 from r2flow.reports import answers
 from r2flow.reports.answer_counts import more_rows
+from r2flow.reports.answer_errors import compared, in_words
 from r2flow.simulator import simulate
 from tests.conftest import SENSOR, Done, prepare_folder, write_run
 from tests.test_completion import network
@@ -94,6 +97,24 @@ def test_errors_at_hidden_rays_stand_beside_the_best_interpolation(r2flow, run, 
     assert noted["answer"]["mae_common_m"] == pytest.approx(off[0], rel=1e-5)
     wrong = ((answer[0] > 0) != (image[0] > 0))[hidden].mean()
     assert noted["answer"]["drop_wrong"] == pytest.approx(wrong)
+    assert f"; wrong in ray-drop {wrong:.1%}, " in said
+
+
+def test_points_left_out_by_their_errors_are_not_wrong_in_ray_drop():
+    image = scans(1)[0].numpy()
+    kept = np.arange(8)[:, None] % 2 == np.zeros(64)
+    state = np.where(image[0] > 0, Ray.RETURN, Ray.EMPTY)
+    answer = torch.from_numpy(image * (kept | (image[0] < 9)))[None]  # far points are left out
+    completed = SimpleNamespace(images=answer)
+    known = Partial(image * kept, np.where(kept, state, Ray.UNKNOWN))
+    given = Partial(image, state), SimpleNamespace(known=known, completed=completed), SENSOR
+    wrong = (image[0] >= 9)[~kept].mean()
+    assert 0 < wrong < 1
+    assert f"; wrong in ray-drop {wrong:.1%}, " in in_words([compared(*given)])
+    found = compared(*given, max_error=0.2)
+    assert "ray-drop" not in in_words([found])
+    assert math.isnan(found.errors["drop_wrong"])
+    assert found.errors["mae_common_m"] == 0
 
 
 @pytest.mark.parametrize("ending", [".bin", ".npy"])

@@ -19,6 +19,7 @@ from r2flow.reports.answer_rays import Answered
 from r2flow.reports.completion import INTERPOLATIONS
 
 COMPARE = "compare.json"
+_DROP = "drop_wrong"
 _COMMON = "mae_common_m"  # where the truth, the answer and all interpolations return
 
 
@@ -34,11 +35,14 @@ class Compared(NamedTuple):
     its_errors: dict[str, float]  # of the interpolation
 
 
-def compared(measured: Partial, answered: Answered, sensor: Sensor) -> Compared:
+def compared(
+    measured: Partial, answered: Answered, sensor: Sensor, max_error: float | None = None
+) -> Compared:
     """Compare the first answer with what was measured at the rays that a mask hid.
 
     Rays that were not measured count nowhere. The best interpolation has the smallest error where
-    it, the others, the answer and the truth return.
+    it, the others, the answer and the truth return. With `max_error` no ray-drop is judged, since
+    points left out are no prediction.
     """
     seen = measured.state != Ray.UNKNOWN
     known = answered.known.state != Ray.UNKNOWN
@@ -51,13 +55,13 @@ def compared(measured: Partial, answered: Answered, sensor: Sensor) -> Compared:
     answer = images[0].numpy()[:channels] * seen
     common = common_mae(truth, [answer, *rules], hidden)
     best = int(np.argmin(common[1:]))
-    return Compared(
-        truth,
-        rules[best],
-        list(INTERPOLATIONS)[best],
-        {_COMMON: common[0], **errors(truth, answer, hidden, sensor)},
-        {_COMMON: common[1 + best], **errors(truth, rules[best], hidden, sensor)},
-    )
+    rows = [
+        {_COMMON: off, **errors(truth, image, hidden, sensor)}
+        for off, image in ((common[0], answer), (common[1 + best], rules[best]))
+    ]
+    if max_error:
+        rows[0][_DROP] = math.nan
+    return Compared(truth, rules[best], list(INTERPOLATIONS)[best], *rows)
 
 
 def write_errors(out: Path, found: Mapping[str, Compared]) -> None:
@@ -82,9 +86,10 @@ def in_words(found: Sequence[Compared]) -> str:
     rows = [one.errors for one in found]
     others = [one.its_errors for one in found]
     names = " or ".join(dict.fromkeys(one.name for one in found))
-    wrong = "drop_wrong"
-    return (
+    told = (
         f"at hidden rays: mean error {mean(rows, _COMMON):.3f} m, best interpolation ({names}) "
-        f"{mean(others, _COMMON):.3f} m; wrong in ray-drop {mean(rows, wrong):.1%}, "
-        f"{mean(others, wrong):.1%}"
+        f"{mean(others, _COMMON):.3f} m"
     )
+    if math.isnan(rows[0][_DROP]):
+        return told
+    return f"{told}; wrong in ray-drop {mean(rows, _DROP):.1%}, {mean(others, _DROP):.1%}"

@@ -71,7 +71,7 @@ def write_completed(
                 from r2flow.reports.answer_errors import compared, write_errors  # slow
 
                 measured = measured_rays(answered.scan, job)
-                beside[name] = compared(measured, answered, checkpoint.sensor)
+                beside[name] = compared(measured, answered, checkpoint.sensor, job.max_error)
                 write_errors(out, {name: beside[name]})
             if answered.number < job.pictures:
                 draw_answers(checkpoint.sensor, answered, out, beside.get(name))
@@ -89,7 +89,12 @@ def write_completed(
         written.append(f"{counts.added / len(left) / job.num:,.0f} new points a scan")
     endings = {scan.ending: files[scan.name][0].suffix for scan in scans}
     written += [f"{one} as {other}" for one, other in endings.items() if not one.endswith(other)]
-    return [*lines, ", ".join(written)]
+    drawn = [out / scans[number].name for number in left if number < job.pictures]
+    lines.append(", ".join(written))
+    if drawn:
+        more = f" and {len(drawn) - 1} more" if len(drawn) > 1 else ""
+        lines.append(f"pictures in {drawn[0]}.png{more}, in 3-D in {drawn[0]}.html{more}")
+    return lines
 
 
 @dataclass(frozen=True)
