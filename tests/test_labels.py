@@ -1,6 +1,8 @@
 """Labels as channels: encoded, trained, drawn, written, painted and judged."""
 
+import json
 import math
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -250,6 +252,13 @@ def test_complete_writes_labels_and_probabilities_and_evaluate_judges_them(
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("classes of")]
     printed = line.partition(": ")[2].split(", ")
     assert dict(one.rsplit(" ", 1) for one in printed) == shares
+    assert "--hide label" not in done.stdout  # all were found
+    assert f"pictures in {out / '0.png'}, in 3-D in {out / '0.html'}" in done.stdout
+    page = (out / "0.html").read_text()
+    assert '"completed, class, found"' in page
+    (legend,) = re.findall(r'"legend":(\[.*?\]\])', page)
+    names = {["no class", *COMMON][number] for number in counts}
+    assert {name for name, _ in json.loads(legend)} == names - {"no class"}
     judged = r2flow("evaluate", truth, out, "--metrics", "miou")
     right = np.mean(common_classes(ids[: len(xyz)]) == classes)
     (line,) = [line for line in judged.said.splitlines() if line.startswith("right  ")]
@@ -259,6 +268,9 @@ def test_complete_writes_labels_and_probabilities_and_evaluate_judges_them(
     # Labels that are given are kept.
     kept = r2flow("complete", truth / "0.bin", "-c", run, "--out", tmp_path / "kept")
     assert kept.returncode == 0, kept.stderr
+    line = "% of these classes are those of 0.label; --hide label finds them anew"
+    assert line in kept.stdout
+    assert re.search(r'"completed, class, \d+% given"', (tmp_path / "kept/0.html").read_text())
     np.testing.assert_array_equal(
         np.fromfile(tmp_path / "kept/0.label", "<u4")[: len(xyz)], semantic_ids(classes)
     )

@@ -41,7 +41,9 @@ COMMON = {
     "person": (30, 31, 32, 253, 254, 255),
     "other": (99, 52),
 }
-_IDS = np.array([0, *(ids[0] for ids in COMMON.values())], np.uint16)
+# Names and colours of these classes by the ids that stand for them.
+STANDING = {ids[0]: (name, CLASSES[ids[0]][1]) for name, ids in COMMON.items()}
+_IDS = np.array([0, *STANDING], np.uint16)
 _COMMON = np.zeros(2**16, np.float32)
 for _number, _members in enumerate(COMMON.values(), 1):
     _COMMON[list(_members)] = _number

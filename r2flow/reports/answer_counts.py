@@ -8,11 +8,11 @@ from numpy import ndarray
 from r2flow.generators import TransferFlow
 from r2flow.lidar.added import unknown_fields
 from r2flow.lidar.known import Ray
-from r2flow.lidar.labels import COMMON
+from r2flow.lidar.labels import COMMON, labels_beside
 from r2flow.lidar.scan_files import WRITTEN
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.reports.answer_rays import Answered
+from r2flow.reports.answer_rays import Answered, given_classes
 
 LITTLE = 0.01  # new points a pixel; why there are fewer is told
 
@@ -38,6 +38,8 @@ class Counts:
     open: float = 0.0  # largest share of unmeasured rays of these
     points: bool = False  # whether there are scans of points
     classes: ndarray = field(default_factory=lambda: np.zeros(1 + len(COMMON), int))  # pixels
+    given: int = 0  # of these with a class that stands beside the scan
+    labels: list[str] = field(default_factory=list)  # the files of these
     unknown: dict[str, None] = field(default_factory=dict)  # fields that added points lack
     beside: bool = False  # whether fields lie in files beside those of the points
 
@@ -48,6 +50,10 @@ class Counts:
         if images.shape[1] > 2:
             found = images[:, 2][returned].astype(int)
             self.classes += np.bincount(found, minlength=len(self.classes))
+        file = scan.path and labels_beside(scan.path)
+        if file and known.points and (given := given_classes(known)).any():
+            self.given += int((returned & given).sum())
+            self.labels.append(file.name)
         new = int((returned & (known.state != Ray.RETURN)).sum())
         self.added += new
         if new < LITTLE * returned.size:
@@ -91,6 +97,12 @@ class Counts:
             largest = sorted(named, reverse=True)
             told = ", ".join(f"{name} {share:.0%}" for share, name in largest if share >= 0.005)
             lines.append(f"classes of the pixels with a return: {told}")
+        if self.labels:
+            more = f" and {len(self.labels) - 1} more" if len(self.labels) > 1 else ""
+            lines.append(
+                f"{self.given / total:.0%} of these classes are those of {self.labels[0]}{more}; "
+                "--hide label finds them anew"
+            )
         return lines
 
     def _why_little(self, model: Checkpoint, max_error: float | None) -> str:

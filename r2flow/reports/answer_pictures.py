@@ -9,7 +9,7 @@ import numpy as np
 from r2flow.lidar.known import Ray
 from r2flow.lidar.labels import semantic_ids
 from r2flow.lidar.sensors import Sensor
-from r2flow.reports.answer_rays import Answered
+from r2flow.reports.answer_rays import Answered, given_classes
 from r2flow.reports.figures import save_figure
 from r2flow.reports.pictures import contact_sheet, trust_ids
 from r2flow.reports.view import Panel, write_viewer
@@ -44,23 +44,30 @@ def draw_answers(
         names += [f"interpolation: {compared.name}", "true"]
         title += f", {in_words([compared])}"
     ids: list[np.ndarray | None] = [None] * len(images)
+    kinds = [""] * len(images)  # of the classes
     if answers.shape[1] > 2:
         ids = [semantic_ids(image[2]) if len(image) > 2 else None for image in images]
+        given = given_classes(known)
+        shares = [(given & (r > 0)).sum() / max((r > 0).sum(), 1) for r in answers[:, 0]]
+        found = [f"class, {share:.0%} given" if share else "class, found" for share in shares]
+        kinds[: 1 + len(answers)] = ["class, given" if given.any() else "", *found]
     unmeasured = known.state == Ray.UNKNOWN
     errors = [np.where(unmeasured, np.nan, 0), *completed.error(0.68)[0, : len(answers)].numpy()]
     images = [image[: min(len(known.image), 2)] for image in images]
     panels = [
         Panel(
-            caption,
+            ", ".join(filter(None, caption)),
             image[None],
             rays,
             None if one is None else one[None],
             errors=None if error is None else error[None],
         )
-        for caption, image, one, error in zip_longest(names, images, ids, errors)
+        for caption, image, one, error in zip_longest(
+            zip(names, kinds, strict=True), images, ids, errors
+        )
     ]
     write_viewer(out / f"{name}.html", panels, title)
-    if completed.densities and answers.shape[1] < 3:
+    if completed.densities and answers.shape[1] < 3 and np.any(errors[1:]):
         ids[1 : len(errors)] = map(trust_ids, answers, errors[1:])
-    figure = contact_sheet(images, rays, names, unmeasured, ids)
+    figure = contact_sheet(images, rays, names, unmeasured, ids, kinds)
     save_figure(figure, out / f"{name}.png")

@@ -13,9 +13,10 @@ from matplotlib.figure import Figure
 from matplotlib.image import BboxImage
 from matplotlib.patches import Patch
 from matplotlib.transforms import Bbox, TransformedBbox
+from scipy.ndimage import maximum_filter
 from torch import Tensor
 
-from r2flow.lidar.labels import CLASSES, semantic_ids
+from r2flow.lidar.labels import CLASSES, STANDING, semantic_ids
 from r2flow.lidar.projection import image_to_points
 
 _MOST_CLASSES = 10  # of a legend
@@ -44,6 +45,14 @@ def trust_ids(image: np.ndarray, error: np.ndarray) -> np.ndarray:
     """
     ids = min(TRUST) + 1 + np.searchsorted(TRUST_LIMITS, error)
     return np.where(error > 0, ids, min(TRUST)) * (image[0] > 0)
+
+
+def _between_added(ids: np.ndarray) -> np.ndarray:
+    """Ids of `TRUST`, (H, W), without measured rays beside added ones, which get the worst id of
+    these: measured and added rows in turn would blend to colours without a meaning on a screen.
+    """
+    worst = maximum_filter(ids, size=3, mode=("nearest", "wrap"))
+    return np.where(ids == min(TRUST), worst, ids)
 
 
 class View(NamedTuple):
@@ -114,46 +123,45 @@ def contact_sheet(
     titles: Sequence[str] = (),
     unmeasured: np.ndarray | None = None,
     labels: Sequence[np.ndarray | None] | None = None,
+    kinds: Sequence[str] = (),
 ) -> Figure:
     """Draw several scans in their common view, one per row: range, reflectance and labels on the
-    left, bird's-eye view and perspective on the right.
+    left, each as high as the others, bird's-eye view and perspective on the right.
 
     Rays of the first scan that were not measured, (H, W) bool, are white. `labels`: semantic ids or
-    those of `TRUST`, (H, W) each; default: those of a labelled model's images.
+    those of `TRUST`, (H, W) each; default: those of a labelled model's images. `kinds`: titles of
+    labels that are classes. A measured ray beside added ones has the colour of the worst of them.
     """
     if labels is None:
         labels = [_labels_of(image) for image in images]
     images = [image[:2] for image in images]
     view = view_of(*((image, rays) for image in images))
-    heights = [1.35 + 0.5 * (ids is not None) for ids in labels]
-    heights[0] += 0.15 * (unmeasured is not None)
-    height = sum(heights) + 0.18
+    strip = max(len(images[0][0]) / 150, 0.42)  # inches: two pixels of a PNG, or more, a row
+    pitch = strip + 0.17  # below is a title
+    counts = [len(image) + (ids is not None) for image, ids in zip(images, labels, strict=True)]
+    heights = [max(count * pitch - 0.17, 1.15) + 0.18 for count in counts]
+    below = [0.13 * (ids is not None) for ids in labels]  # a legend
+    height = sum(heights) + sum(below) + 0.02
     figure = Figure((_WIDTH, height), facecolor="white")
-    grid = figure.add_gridspec(
-        len(images),
-        3,
-        height_ratios=heights,
-        width_ratios=[2.6, 0.9, 1.3],
-        hspace=0.24,
-        wspace=0.13,
-        left=0.01,
-        right=0.94,
-        top=1 - 0.18 / height,
-        bottom=0.02 if labels[-1] is None else 0.14 / height,  # below is a legend
-    )
+    top = height
     for row, (image, ids) in enumerate(zip(images, labels, strict=True)):
-        count = len(image) + (ids is not None)
-        cells = grid[row, 0].subgridspec(count, 1, hspace=0.3)
-        strips = [figure.add_subplot(cells[i]) for i in range(count)]
+        top -= 0.18
+
+        def axes_at(left: float, width: float, down: float, high: float, top: float = top) -> Any:
+            return figure.add_axes((left, (top - down - high) / height, width, high / height))
+
+        strips = [axes_at(0.01, 0.464, i * pitch, strip) for i in range(counts[row])]
         title = titles[row] if row < len(titles) else ""
-        _draw_strips(strips, image, ids, view, title, row == 0)
-        views = [figure.add_subplot(grid[row, i]) for i in (1, 2)]
+        _draw_strips(strips, image, ids, view, title, row == 0, *kinds[row : row + 1])
+        views = [axes_at(0.511, 0.16, 0, 1.15), axes_at(0.708, 0.232, 0, 1.15)]
         _draw_views(views, image, rays, view, row == 0, ids)
+        top -= heights[row] - 0.18 + below[row]
         if row == 0 and unmeasured is not None:
             white = np.repeat(unmeasured[..., None], 4, axis=2).astype(float)
             for axes in strips[: len(image)]:
                 axes.imshow(white, aspect="auto", interpolation="nearest")
-            _add_legend(axes, {"not measured": "white", "measured, no return": "black"})
+            names = {"not measured": "white", "measured, no return": "black"}
+            _add_legend(strips[0], names, loc="lower right", bbox_to_anchor=(1, 1))
     return figure
 
 
@@ -169,6 +177,7 @@ def _draw_strips(
     view: View,
     title: str = "",
     first: bool = True,
+    kind: str = "class",
 ) -> None:
     """Draw range on a logarithmic scale, the root of reflectance and labels; dropped rays black.
 
@@ -183,9 +192,9 @@ def _draw_strips(
     if len(image) > 1:
         values = np.ma.masked_where(dropped, np.sqrt(np.clip(image[1], 0, 1)))
         ticks = {0: 0.0, 0.2: 0.2**0.5, 0.8: 0.8**0.5}
-        _draw_values(strips[1], values, "reflectance", ticks, "reflectance" if first else "", first)
+        _draw_values(strips[1], values, "reflectance", ticks, "reflectance", first)
     if labels is not None:
-        _draw_labels(strips[-1], labels)
+        _draw_labels(strips[-1], labels, kind)
 
 
 def _draw_values(
@@ -199,14 +208,16 @@ def _draw_values(
         _add_bar(axes, scale, ticks)
 
 
-def _draw_labels(axes: Any, labels: np.ndarray) -> None:
+def _draw_labels(axes: Any, labels: np.ndarray, kind: str) -> None:
     """Draw semantic ids with a legend of the classes."""
+    if TRUST.keys() >= {*labels[labels > 0].tolist()}:
+        labels = _between_added(labels)
     classes = class_colours(labels[labels > 0], _MOST_CLASSES)
     axes.imshow(_in_class_colours(labels, "black")[..., :3], aspect="auto", interpolation="nearest")
     trusted = classes.keys() & TRUST.keys()
     black = {"no return": "black"} if trusted else {}
     _add_legend(axes, {**dict(classes.values()), **black})
-    _frame(axes, TRUST_TITLE if trusted else "class", "black")
+    _frame(axes, TRUST_TITLE if trusted else kind, "black")
 
 
 def _in_class_colours(labels: np.ndarray, other: str) -> np.ndarray:
@@ -221,14 +232,16 @@ def class_colours(labels: np.ndarray, most: int) -> dict[int, tuple[str, str]]:
     """Name and colour of the `most` most frequent semantic ids in labels, (N,), in order of
     frequency.
 
-    Names are SemanticKITTI's if it defines all ids, else numbers.
+    Names are those of a labelled model's classes if all ids stand for one, else SemanticKITTI's if
+    it defines all ids, else numbers.
     """
     ids, counts = np.unique(labels, return_counts=True)
     ordered = ids[np.argsort(-counts)][:most].tolist()
     if TRUST.keys() >= set(ordered):
         return {label: TRUST[label] for label in sorted(ordered)}
-    if CLASSES.keys() >= set(ids.tolist()):
-        return {label: CLASSES[label] for label in ordered}
+    for known in (STANDING, CLASSES):
+        if known.keys() >= set(ids.tolist()):
+            return {label: known[label] for label in ordered}
     hues = colormaps["hsv"]  # the golden ratio separates the hues of neighbouring ids
     return {label: (f"class {label}", to_hex(hues(label * 0.618034 % 1))) for label in ordered}
 
@@ -257,9 +270,9 @@ def _draw_views(
     near = (np.abs(points[:, :2]) < reach).all(axis=1)
     size = np.full(near.sum(), np.clip(6_000 / max(near.sum(), 1), 0.2, 1.0))
     above.add_artist(_Dots(points[near][:, :2] @ [[0, 1], [-1, 0]], colour[near], size))
-    above.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+    above.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", anchor="N")
     above.plot(0, 0, marker="^", color="black", ms=3)
-    _frame(above, f"bird's-eye view, {2 * reach:.0f} m" if first else "")
+    _frame(above, f"bird's-eye view, {2 * reach:.0f} m wide" if first else "")
 
     eye = _EYE * (1 if reach > _ROOM else 4)
     seen = (points / reach - eye) @ _AXES
@@ -268,7 +281,7 @@ def _draw_views(
     place, depth = seen[order, :2], seen[order, 2]
     size = np.clip(0.14 / depth, 0.3, 0.8) * np.sqrt(30_000 / max(len(points), 1))
     ahead.add_artist(_Dots(place / depth[:, None], colour[order], size))
-    ahead.set(xlim=(-0.95, 0.95), ylim=(-0.62, 0.48), aspect="equal")
+    ahead.set(xlim=(-0.95, 0.95), ylim=(-0.62, 0.48), aspect="equal", anchor="N")
     _frame(ahead, title)
     if first and not by_class:
         low, high = view.heights
@@ -323,12 +336,11 @@ def _frame(axes: Any, title: str, background: str = "white") -> None:
     axes.set_title(title, fontsize=7, loc="left", pad=2)
 
 
-def _add_legend(axes: Any, names: Mapping[str, str]) -> None:
-    """Explain colours, by name, below some axes."""
+def _add_legend(axes: Any, names: Mapping[str, str], **place: Any) -> None:
+    """Explain colours, by name, below some axes or at another place."""
     axes.legend(
         handles=[Patch(fc=colour, ec="0.7", lw=0.5, label=name) for name, colour in names.items()],
-        loc="upper left",
-        bbox_to_anchor=(0, 0),
+        **{"loc": "upper left", "bbox_to_anchor": (0, 0), **place},
         borderpad=0,
         ncols=len(names),
         columnspacing=1.2,

@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgba
@@ -5,7 +7,7 @@ from matplotlib.colors import to_rgba
 from r2flow.lidar.labels import CLASSES
 from r2flow.lidar.sensors import SENSORS
 from r2flow.reports.figures import figure_pixels, save_figure
-from r2flow.reports.pictures import STREET, _Dots, contact_sheet, scan_figure, trust_ids
+from r2flow.reports.pictures import STREET, TRUST, _Dots, contact_sheet, scan_figure, trust_ids
 
 SENSOR = SENSORS["hdl64e"].resized(16, 64)
 E, A = SENSOR.rays().numpy()
@@ -56,6 +58,41 @@ def test_no_two_legends_of_a_completed_scan_give_a_colour_two_meanings():
     assert len({colour for colour, _ in meanings}) == len(names) - 1  # black: no return
     titles = [axes.get_title("left") for axes in figure.axes]
     assert titles.count("predicted error (68 %)") == 1  # of the second scan alone
+
+
+def test_every_row_of_a_sensor_is_as_high_in_each_scan_of_a_sheet():
+    """Two pixels of a PNG at least; the scan, its answer with classes, and one without."""
+    sensor = SENSORS["hdl64e"].resized(128, 64)
+    scan = np.full((2, *sensor.shape), 10.0, np.float32)
+    ids = [None, np.full(sensor.shape, 40), None]
+    images = [scan[:1], scan, scan]
+    figure = contact_sheet(images, sensor.rays(), (), scan[0] > 99, ids, ["", "given"])
+    boxes = [axes.get_window_extent() for axes in figure.axes if axes.images]
+    assert len(boxes) == 1 + 3 + 2
+    inches = [box.height / figure.dpi for box in boxes]
+    np.testing.assert_allclose(inches, inches[0])
+    assert 300 * inches[0] >= 2 * 128
+    assert [axes.get_title("left") for axes in figure.axes].count("given") == 1
+    assert not any(one.overlaps(other) for one, other in pairwise(boxes))
+
+
+def test_measured_rows_do_not_blend_with_the_errors_between_them():
+    """Rows measured and added in turn: the strip has the colours of errors alone; a sector that
+    was measured keeps its own.
+    """
+    scan = image(np.full_like(E, 10.0))
+    error = np.zeros(E.shape)
+    error[::2, :40] = 0.1
+    error[4, :40] = 0.5
+    figure = contact_sheet([scan], SENSOR.rays(), labels=[trust_ids(scan, error)])
+    shown = (255 * figure.axes[2].images[0].get_array()).round().astype(int)
+    near, far, measured = (
+        np.rint(255 * np.array(to_rgba(TRUST[number][1])[:3])) for number in (65002, 65003, 65000)
+    )
+    assert (shown[:3, :40] == near).all()
+    assert (shown[3:6, :40] == far).all()  # the worse of the two rows beside
+    assert (shown[6:-1, :40] == near).all()
+    assert (shown[:, 42:-2] == measured).all()
 
 
 def test_classes_of_labelled_scans_have_a_strip_and_a_legend():

@@ -104,7 +104,7 @@ def test_what_is_unpacked_is_the_scan(farthest):
 
 def test_labels_have_their_names_and_colours():
     ids = np.full(SENSOR.shape, 40)
-    ids[:2], ids[7] = 10, 0
+    ids[:2], ids[7] = 11, 0  # a bicycle is no class of a labelled model
     panels = [
         Panel("scan", image[None], RAYS, of)
         for image, of in zip(images(2, 1), (ids[None], None), strict=True)
@@ -113,7 +113,7 @@ def test_labels_have_their_names_and_colours():
     assert [one["labels"] for one in data["scans"]] == [True, False]
     assert [one["reflectance"] for one in data["scans"]] == [False, False]
     _, numbers = unpacked(data, 0)
-    assert data["classes"][numbers[0, 0]] == list(CLASSES[10])
+    assert data["classes"][numbers[0, 0]] == list(CLASSES[11])
     assert data["classes"][numbers[4, 0]] == list(CLASSES[40])
     assert data["classes"][numbers[7, 0]][0] == "no class"
 
