@@ -1,7 +1,7 @@
 """Modules of one's own in the place of a backbone."""
 
 from inspect import Parameter, Signature, signature
-from typing import Any, ClassVar
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -54,9 +54,11 @@ def backbone_class(module: Any) -> type[Backbone]:
     )
     own = keywords_of(module)
     common = keywords_of(Backbone, given=2)
+    options = [one.replace(kind=one.KEYWORD_ONLY) for one in {**own, **common}.values()]
+    rays = Parameter("rays", Parameter.POSITIONAL_ONLY)
 
     class Own(ModuleBackbone):
-        __signature__: ClassVar[Signature]
+        __signature__ = Signature([rays, *(one for one in options if one.name != "rays")])
 
         def __init__(
             self,
@@ -71,8 +73,5 @@ def backbone_class(module: Any) -> type[Backbone]:
             shared = {name: options[name] for name in options.keys() & common}
             super().__init__(rays, network, **shared)
 
-    rays = Parameter("rays", Parameter.POSITIONAL_ONLY)
-    named = [one.replace(kind=one.KEYWORD_ONLY) for one in {**own, **common}.values()]
-    Own.__signature__ = Signature([rays, *(one for one in named if one.name != "rays")])
     Own.__name__, Own.__module__ = module.__name__, module.__module__
     return Own

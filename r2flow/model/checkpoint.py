@@ -377,16 +377,11 @@ def _of_torch(content: Any, path: Path, averaged: bool, backbone: nn.Module | No
         config = config_of(
             content[HYPER], content.get("datamodule_hyper_parameters") or {}, notes["stage"]
         )
-        network = config["backbone"]
-        about = str(path)
-        if backbone is None and network and "network" in network:  # its class alone
-            config["backbone"] = BACKBONES.options(network)
-            if config["backbone"] != network:
-                about += f": {network['network']} by its defaults"
+        if backbone is None and config["backbone"]:  # may name the class of a network alone
+            config["backbone"] = BACKBONES.options(config["backbone"])
         config |= {"plugins": notes["plugins"], "trainer": {"max_steps": notes["total_steps"]}}
         step = int(content.get("global_step", 0))
-        with naming(about):
-            return _built(ModelConfig(config), weights, notes, path, step, backbone)
+        return _built(ModelConfig(config), weights, notes, path, step, backbone)
     systems = ", ".join(known.system for known in FORMATS.values())
     found = (
         ", ".join(map(repr, list(content)[:6]))
@@ -450,7 +445,8 @@ def check_weights(model: nn.Module, weights: Mapping[str, Tensor]) -> None:
         found = f"'{name}' has shape {tuple(weight.shape)} ({weight.layout}, {weight.dtype})"
         check(
             fits and is_dense(weight),
-            f"{unlike} {found}, the config makes it {tuple(value.shape)} ({value.dtype}).",
+            f"{unlike} {found}, the config (or a plug-in's class by its defaults) makes it "
+            f"{tuple(value.shape)} ({value.dtype}).",
         )
     # buffers may be infinite, as the mask of an attention
     trained = (name for name, _ in model.named_parameters())

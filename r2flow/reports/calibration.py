@@ -1,6 +1,7 @@
 """Factors of predicted errors for the scans of one sensor, by split conformal prediction."""
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -48,18 +49,18 @@ def calibrate(
     reflectance_scale: float | None = None,
 ) -> Trust:
     """Write the sensor of scans, by name or YAML file, with the factors of `trust_of` on at most
-    `num` of them. A file that is there keeps its comment.
+    `num` of them, and with the comment of its file.
     """
     plain = named_sensor(sensor)
     flow = model.through(plain)
     _, images = real_scans(flow, [real], reflectance_scale, num, need_reflectance=False)
     with Bar("completing", len(images) * len(TASKS), "evaluations") as advance:
         trust = trust_of(flow, [*images.numpy()], advance)
-    lines = out.read_text(encoding="utf-8").splitlines() if out.exists() else []
-    said = [line for line in lines if line.startswith("#") and "error_factors" not in line]
-    about = f"error_factors: r2flow calibrate, {title_of(model.path)}, {len(images)} scans"
-    comment = "\n".join(line.removeprefix("#").strip() for line in [*said[:-1], about])
-    write_sensor(replace(plain, error_factors=trust.factors), out, comment)
+    file = Path(sensor)
+    text = file.read_text(encoding="utf-8") if file.is_file() else ""
+    said = re.findall(r"^#\s?(?!\s?error_factors)(.*)", text, re.M)[:-1]
+    said.append(f"error_factors: r2flow calibrate, {title_of(model.path)}, {len(images)} scans")
+    write_sensor(replace(plain, error_factors=trust.factors), out, "\n".join(said))
     return trust
 
 
