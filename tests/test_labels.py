@@ -203,6 +203,7 @@ def test_a_labelled_flow_trains_on_labelled_scans_of_each_kind(tmp_path: Path):
     (tmp_path / "1.label").unlink()
     assert not read_image(tmp_path / "1.bin", Reading(SENSOR, labels=True))[2].any()
     np.save(tmp_path / "0.npy", image[:2])
+    (tmp_path / "manifest.json").write_text("{}")  # without it 0.bin might be of another scan
     of_image = read_image(tmp_path / "0.npy", Reading(SENSOR, labels=True))
     np.testing.assert_array_equal(of_image[2], image[2])
     np.save(tmp_path / "2.npy", image[:2])

@@ -1,5 +1,6 @@
 """What was taken of scans of points, and added to scans, in lines of the terminal."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +13,7 @@ from r2flow.lidar.labels import COMMON, labels_beside
 from r2flow.lidar.scan_files import WRITTEN
 from r2flow.lidar.sensors import SENSORS, Sensor
 from r2flow.model.checkpoint import Checkpoint
-from r2flow.reports.answer_rays import Answered, given_classes
+from r2flow.reports.answer_rays import Answered
 
 LITTLE = 0.01  # new points a pixel; why there are fewer is told
 
@@ -27,6 +28,11 @@ def more_rows(sensor: Sensor, own: bool, image: bool = False) -> str:
     return f"{source}{f'--to {name} ' if own else ''}--size {2 * rows}x{columns}"
 
 
+def and_more(names: Sequence[object]) -> str:
+    """The first of some names, and the number of others."""
+    return f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else str(names[0])
+
+
 @dataclass
 class Counts:
     """What was taken of scans of points, and added to scans."""
@@ -36,7 +42,6 @@ class Counts:
     added: int = 0
     little: list[str] = field(default_factory=list)  # names of scans with next to no new points
     open: float = 0.0  # largest share of unmeasured rays of these
-    points: bool = False  # whether there are scans of points
     classes: ndarray = field(default_factory=lambda: np.zeros(1 + len(COMMON), int))  # pixels
     given: int = 0  # of these with a class that stands beside the scan
     labels: list[str] = field(default_factory=list)  # the files of these
@@ -51,7 +56,7 @@ class Counts:
             found = images[:, 2][returned].astype(int)
             self.classes += np.bincount(found, minlength=len(self.classes))
         file = scan.path and labels_beside(scan.path)
-        if file and known.points and (given := given_classes(known)).any():
+        if file and known.points and (given := known.image[2:].any(0)).any():
             self.given += int((returned & given).sum())
             self.labels.append(file.name)
         new = int((returned & (known.state != Ray.RETURN)).sum())
@@ -60,7 +65,6 @@ class Counts:
             self.little.append(scan.name)
             self.open = max(self.open, (known.state == Ray.UNKNOWN).mean())
         if not scan.image:
-            self.points = True
             self.rays += np.bincount(known.state.ravel(), minlength=len(Ray))
         if known.points and known.points.cloud:
             cloud = known.points.cloud
@@ -68,7 +72,7 @@ class Counts:
             self.unknown |= dict.fromkeys(unknown_fields(cloud))
             self.beside |= cloud.names is None and scan.ending in WRITTEN
 
-    def lines(self, model: Checkpoint, max_error: float | None = None) -> list[str]:
+    def lines(self, model: Checkpoint) -> list[str]:
         """What was taken of points, and why little was added."""
         sensor = model.sensor
         lines = []
@@ -91,32 +95,30 @@ class Counts:
                 f"outside {sensor.min_range:g}-{sensor.max_range:g} m left out"
             )
         if self.little:
-            lines.append(self._why_little(model, max_error))
+            lines.append(self._why_little(model))
         if (total := self.classes.sum()) > 0:
             named = zip(self.classes / total, ["no class", *COMMON], strict=True)
             largest = sorted(named, reverse=True)
             told = ", ".join(f"{name} {share:.0%}" for share, name in largest if share >= 0.005)
             lines.append(f"classes of the pixels with a return: {told}")
         if self.labels:
-            more = f" and {len(self.labels) - 1} more" if len(self.labels) > 1 else ""
             lines.append(
-                f"{self.given / total:.0%} of these classes are those of {self.labels[0]}{more}; "
+                f"{self.given / total:.0%} of these classes are those of {and_more(self.labels)}; "
                 "--hide label finds them anew"
             )
         return lines
 
-    def _why_little(self, model: Checkpoint, max_error: float | None) -> str:
-        first, *others = self.little
-        more = f" and {len(others)} more" if others else ""
+    def _why_little(self, model: Checkpoint) -> str:
         rows, columns = model.sensor.shape
         if self.open < 0.1:
             why = f"the scan fills all {rows}x{columns} rays; "
             if isinstance(model.generator, TransferFlow):
-                finer = more_rows(model.sensor, model.chosen, not self.points)
+                finer = more_rows(model.sensor, model.chosen, not self.rays.any())
                 why += f"{finer} has rows between them, "
             why += "--mask rows:4 hides some to compare"
-        elif max_error:
-            why = f"points with an error_68 above {max_error:g} m are left out; see --max-error"
         else:
-            why = "the unmeasured rays are in whole sectors, beyond the beams, or return nothing"
-        return f"{first}{more}: hardly a new point, as {why}"
+            why = (
+                "the unmeasured rays are in whole sectors, beyond the beams, return nothing or "
+                "exceed --max-error"
+            )
+        return f"{and_more(self.little)}: hardly a new point, as {why}"

@@ -9,7 +9,7 @@ import numpy as np
 from r2flow.lidar.known import Ray
 from r2flow.lidar.labels import semantic_ids
 from r2flow.lidar.sensors import Sensor
-from r2flow.reports.answer_rays import Answered, given_classes
+from r2flow.reports.answer_rays import Answered
 from r2flow.reports.figures import save_figure
 from r2flow.reports.pictures import contact_sheet, trust_ids
 from r2flow.reports.view import Panel, write_viewer
@@ -47,7 +47,7 @@ def draw_answers(
     kinds = [""] * len(images)  # of the classes
     if answers.shape[1] > 2:
         ids = [semantic_ids(image[2]) if len(image) > 2 else None for image in images]
-        given = given_classes(known)
+        given = known.image[2:].any(0)
         shares = [(given & (r > 0)).sum() / max((r > 0).sum(), 1) for r in answers[:, 0]]
         found = [f"class, {share:.0%} given" if share else "class, found" for share in shares]
         kinds[: 1 + len(answers)] = ["class, given" if given.any() else "", *found]

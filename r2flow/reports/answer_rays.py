@@ -44,11 +44,6 @@ class Answered:
     completed: Completed
 
 
-def given_classes(known: Partial) -> np.ndarray:
-    """The rays whose class was given with the scan, (H, W) bool."""
-    return known.image[2:].any(0)
-
-
 def lack_sectors(scans: Sequence[PartialScan], job: Job) -> bool:
     """Whether most unknown rays of each scan lie in sectors without known rays; ignores scans
     without unknown rays.

@@ -15,7 +15,7 @@ from r2flow.data.partial import PartialScan
 from r2flow.generators import Sampler
 from r2flow.model.checkpoint import Checkpoint
 from r2flow.model.completion import complete
-from r2flow.reports.answer_counts import Counts
+from r2flow.reports.answer_counts import Counts, and_more
 from r2flow.reports.answer_files import answer_files, check_inputs, write_answers
 from r2flow.reports.answer_pictures import draw_answers
 from r2flow.reports.answer_rays import Answered, Job, known_rays, measured_rays
@@ -77,7 +77,7 @@ def write_completed(
                 draw_answers(checkpoint.sensor, answered, out, beside.get(name))
             counts.add(answered)
         bar.set(len(left) * job.num)
-    lines = counts.lines(checkpoint, job.max_error)
+    lines = counts.lines(checkpoint)
     if beside:
         from r2flow.reports.answer_errors import COMPARE, in_words
 
@@ -89,11 +89,10 @@ def write_completed(
         written.append(f"{counts.added / len(left) / job.num:,.0f} new points a scan")
     endings = {scan.ending: files[scan.name][0].suffix for scan in scans}
     written += [f"{one} as {other}" for one, other in endings.items() if not one.endswith(other)]
-    drawn = [out / scans[number].name for number in left if number < job.pictures]
     lines.append(", ".join(written))
+    drawn = [out / f"{scans[number].name}.png" for number in left if number < job.pictures]
     if drawn:
-        more = f" and {len(drawn) - 1} more" if len(drawn) > 1 else ""
-        lines.append(f"pictures in {drawn[0]}.png{more}, in 3-D in {drawn[0]}.html{more}")
+        lines.append(f"pictures in {and_more(drawn)}, in 3-D in {drawn[0].with_suffix('.html')}")
     return lines
 
 

@@ -41,18 +41,12 @@ TRUST = {
 
 def trust_ids(image: np.ndarray, error: np.ndarray) -> np.ndarray:
     """The ids of `TRUST` of a scan, (C, H, W), with the 68 % error of each ray in metres, (H, W);
-    0 without a return.
+    0 without a return. A measured ray beside added ones has the worst id of these: measured and
+    added rows in turn would blend on a screen to colours without a meaning.
     """
-    ids = min(TRUST) + 1 + np.searchsorted(TRUST_LIMITS, error)
-    return np.where(error > 0, ids, min(TRUST)) * (image[0] > 0)
-
-
-def _between_added(ids: np.ndarray) -> np.ndarray:
-    """Ids of `TRUST`, (H, W), without measured rays beside added ones, which get the worst id of
-    these: measured and added rows in turn would blend to colours without a meaning on a screen.
-    """
-    worst = maximum_filter(ids, size=3, mode=("nearest", "wrap"))
-    return np.where(ids == min(TRUST), worst, ids)
+    ids = np.where(error > 0, min(TRUST) + 1 + np.searchsorted(TRUST_LIMITS, error), min(TRUST))
+    worst = maximum_filter(ids * (image[0] > 0), size=3, mode=("nearest", "wrap"))
+    return np.where(error > 0, ids, worst) * (image[0] > 0)
 
 
 class View(NamedTuple):
@@ -130,7 +124,7 @@ def contact_sheet(
 
     Rays of the first scan that were not measured, (H, W) bool, are white. `labels`: semantic ids or
     those of `TRUST`, (H, W) each; default: those of a labelled model's images. `kinds`: titles of
-    labels that are classes. A measured ray beside added ones has the colour of the worst of them.
+    labels that are classes.
     """
     if labels is None:
         labels = [_labels_of(image) for image in images]
@@ -145,15 +139,17 @@ def contact_sheet(
     figure = Figure((_WIDTH, height), facecolor="white")
     top = height
     for row, (image, ids) in enumerate(zip(images, labels, strict=True)):
-        top -= 0.18
-
-        def axes_at(left: float, width: float, down: float, high: float, top: float = top) -> Any:
-            return figure.add_axes((left, (top - down - high) / height, width, high / height))
-
-        strips = [axes_at(0.01, 0.464, i * pitch, strip) for i in range(counts[row])]
+        top -= 0.18  # a title
+        strips = [
+            figure.add_axes((0.01, (top - i * pitch - strip) / height, 0.464, strip / height))
+            for i in range(counts[row])
+        ]
         title = titles[row] if row < len(titles) else ""
         _draw_strips(strips, image, ids, view, title, row == 0, *kinds[row : row + 1])
-        views = [axes_at(0.511, 0.16, 0, 1.15), axes_at(0.708, 0.232, 0, 1.15)]
+        views = [
+            figure.add_axes((left, (top - 1.15) / height, width, 1.15 / height))
+            for left, width in ((0.511, 0.16), (0.708, 0.232))
+        ]
         _draw_views(views, image, rays, view, row == 0, ids)
         top -= heights[row] - 0.18 + below[row]
         if row == 0 and unmeasured is not None:
@@ -210,8 +206,6 @@ def _draw_values(
 
 def _draw_labels(axes: Any, labels: np.ndarray, kind: str) -> None:
     """Draw semantic ids with a legend of the classes."""
-    if TRUST.keys() >= {*labels[labels > 0].tolist()}:
-        labels = _between_added(labels)
     classes = class_colours(labels[labels > 0], _MOST_CLASSES)
     axes.imshow(_in_class_colours(labels, "black")[..., :3], aspect="auto", interpolation="nearest")
     trusted = classes.keys() & TRUST.keys()
