@@ -132,18 +132,14 @@ def view(
         scans: how.reading([scans], None if scans.stored else first, estimate=True)
         for scans in described.values()
     }
-    readings = share_scale(readings, num or _SCANS)
-    drawn = [] if sequence else list(scan_panels(readings, num or _SCANS))
+    drawn = list(scan_panels(share_scale(readings, num or _SCANS), num or _SCANS))
     panels = []
     for spec in what:
         if spec in models:
             panels += sample_panels(models[spec], spec, num or _SAMPLES, seed, steps or ())
-        elif sequence:
-            scans = described[spec]
-            frames = scan_panels({scans: readings[scans]}, num or _SCANS)
-            panels.append(as_frames([panel for _, panel in frames], spec))
         else:
-            panels += [panel for of, panel in drawn if of is described[spec]]
+            own = [panel for of, panel in drawn if of is described[spec]]
+            panels += [as_frames(own, spec)] if sequence else own
     content = page(panels, ", ".join(Path(spec).name or spec for spec in what))
     path = out or Path(mkdtemp(prefix="r2flow-"), "view.html")
     write_file(path, content)

@@ -32,9 +32,9 @@ def draw_answers(
     rays = sensor.rays()
     name, known, completed = answered.scan.name, answered.known, answered.completed
     answers = completed.images.numpy()[:_MOST]
-    names = ["your scan", "completed"]
-    if len(answers) > 1:
-        names = ["your scan", *(f"completed, answer {i}" for i in range(len(answers)))]
+    names = ["your scan", *(f"completed, answer {i}" for i in range(len(answers)))]
+    if len(answers) == 1:
+        names[1] = "completed"
     images = [known.image, *answers]
     title = name
     if compared:

@@ -113,16 +113,16 @@ def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
             "images with "
             f"{pixels:,}. Take fewer scans or frames (--num)."
         )
-    sensors: dict[bytes, dict[str, Any]] = {}
+    described = []
     labelled = [panel.labels[panel.labels > 0] for panel in panels if panel.labels is not None]
     classes = class_colours(np.concatenate(labelled), most=255) if labelled else {}
     farthest = max(np.nan_to_num(panel.images[:, 0], posinf=0).max() for panel in panels)
     step = max(STEP, float(farthest) / (_CODES - 1))
     scans = []
     for panel in panels:
-        angles = np.asarray(panel.rays, dtype=np.float64)
-        key = angles.tobytes()
-        sensors[key] = described_rays(angles)
+        rays = described_rays(np.asarray(panel.rays, dtype=np.float64))
+        if rays not in described:
+            described.append(rays)
         planes = []
         if panel.labels is not None:
             planes.append(_class_numbers(panel.labels, classes))
@@ -133,7 +133,7 @@ def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
         scans.append(
             {
                 "caption": printable(panel.caption),
-                "rays": list(sensors).index(key),
+                "rays": described.index(rays),
                 "frames": [
                     _packed_image(image, step, *numbers)
                     for image, *numbers in zip(panel.images, *planes, strict=True)
@@ -146,7 +146,7 @@ def _contents(panels: Sequence[Panel]) -> dict[str, Any]:
     view = view_of(*((panel.images[0], panel.rays) for panel in panels))
     return {
         "scans": scans,
-        "rays": list(sensors.values()),
+        "rays": described,
         "frames": [printable(frame) for frame in max((p.frames for p in panels), key=len)],
         "metres": step,
         "ranges": view.ranges,
@@ -208,7 +208,7 @@ def described_rays(rays: ndarray) -> dict[str, Any]:
 
 def _class_numbers(ids: ndarray, classes: dict[int, tuple[str, str]]) -> ndarray:
     """Class number of each id, from 1, (T, H, W); 0 for ids without a class."""
-    table = np.zeros(int(max(ids.max(), *classes, 0)) + 1, np.uint8)
+    table = np.zeros(2**16, np.uint8)
     table[list(classes)] = np.arange(1, len(classes) + 1)
     return table[ids]
 

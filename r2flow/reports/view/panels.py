@@ -86,10 +86,10 @@ def _read_labels(source: ScanSource, number: int) -> ndarray | None:
         path = points_beside(Path(source.paths[number]))
         file = labels_beside(path)
         if file and read_range_image(path) is None:
-            reading = replace(source.reading, on_bad_scan="error")
             # ids of an unknown list are shown by their numbers
-            ids = None if reading.label_ids is SEMANTIC_KITTI else reading.label_ids
-            return read_labelled_scan(path, file, reading, ids)[1][None]
+            ids = source.reading.label_ids
+            listed = None if ids is SEMANTIC_KITTI else ids
+            return read_labelled_scan(path, file, source.reading, listed)[1][None]
     return None
 
 

@@ -82,7 +82,10 @@ function load(scan, frame) {
       const rays = page.rays[scan.rays];
       made.texels = texelsOf(bytes, scan, rays);
       made.points = new Uint32Array(ERRORS.length); // by the number of their error
-      for (let i = 0; i < made.texels.length; i += 4) if (scan.errors && made.texels[i]) made.points[made.texels[i + 3]]++;
+      for (let i = 0; scan.errors && i < made.texels.length; i += 4) {
+        if (made.texels[i]) made.points[made.texels[i + 3]]++;
+        else if (made.texels[i + 3]) page.unmeasured = true; // the legend explains such rays
+      }
       made.texture = texture(gl.RGBA16UI, rays.columns, rays.rows, gl.RGBA_INTEGER, gl.UNSIGNED_SHORT, made.texels);
     });
     loading.set(packed, made);
@@ -670,7 +673,7 @@ function turn(by) {
 async function show() {
   await Promise.all(shownScans().map((scan) => current(scan).ready));
   count();
-  redraw();
+  setMode(state.mode);
 }
 
 
@@ -836,7 +839,7 @@ function setMode(mode) {
     bar(stops.slice(8));
     say(rounded(high));
   }
-  if (MODES.includes("error")) [["not measured", UNMEASURED], ["no return", "#000000"]].forEach(name);
+  if (page.unmeasured) [["not measured", UNMEASURED], ["no return", "#000000"]].forEach(name);
   redraw();
 }
 
