@@ -257,9 +257,9 @@ def test_complete_writes_labels_and_probabilities_and_evaluate_judges_them(
     assert f"pictures in {out / '0.png'}, in 3-D in {out / '0.html'}" in done.stdout
     page = (out / "0.html").read_text()
     assert '"completed, class, found"' in page
-    (legend,) = re.findall(r'"legend":(\[.*?\]\])', page)
+    (classes_shown,) = re.findall(r'"classes":(\[\["no class".*?\]\])', page)
     names = {["no class", *COMMON][number] for number in counts}
-    assert {name for name, _ in json.loads(legend)} == names - {"no class"}
+    assert {name for name, _ in json.loads(classes_shown)} == names | {"no class"}
     judged = r2flow("evaluate", truth, out, "--metrics", "miou")
     right = np.mean(common_classes(ids[: len(xyz)]) == classes)
     (line,) = [line for line in judged.said.splitlines() if line.startswith("right  ")]
