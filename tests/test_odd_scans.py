@@ -101,6 +101,14 @@ def test_the_same_sensor_command_finds_its_file(r2flow, tmp_path):
     assert "with other content" in r2flow("sensor", tmp_path / "scan.bin", "--out", out).refusal
 
 
+def test_the_ceiling_above_a_low_robot_is_not_the_ground():
+    """Its floor, 0.35 m below, is seen from 1 to 3 m; its ceiling, 2 m above, from 3 to 6 m."""
+    azimuth = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+    rings = [(r, -0.35) for r in np.linspace(1, 3, 20)] + [(r, 2.0) for r in np.linspace(3, 6, 20)]
+    xyz = [np.c_[r * np.cos(azimuth), r * np.sin(azimuth), 0 * azimuth + z] for r, z in rings]
+    assert not hangs([Points(np.concatenate(xyz).astype(np.float32))])
+
+
 def test_a_sensor_file_with_aliases_or_long_values_is_one_short_line(r2flow, tmp_path):
     file = tmp_path / "mine.yaml"
     for text in (
