@@ -250,7 +250,7 @@ def calibrate(
 
     file = out or Path(sensor)
     is_yaml = file.suffix.lower() in ENDINGS
-    check(is_yaml, f"{file} is no file that takes the factors: give --out {file.stem}_mine.yaml.")
+    check(is_yaml, f"{file} cannot hold the factors: give --out {file.stem}_mine.yaml.")
     flow = load_checkpoint(model, choose_device(device))
     trust = calibrate_sensor(flow, real, sensor, file, num, reflectance_scale)
     (first, second), (near, far) = trust.factors, trust.shares

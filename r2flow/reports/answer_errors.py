@@ -42,7 +42,7 @@ def compared(
 
     Rays that were not measured count nowhere. The best interpolation has the smallest error where
     it, the others, the answer and the truth return. With `max_error` no ray-drop is judged, since
-    points left out are no prediction.
+    points left out are not predicted.
     """
     seen = measured.state != Ray.UNKNOWN
     known = answered.known.state != Ray.UNKNOWN

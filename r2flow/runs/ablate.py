@@ -151,7 +151,7 @@ def _judge(ablation: Ablation, held_out: str, num: int, device: str, workers: in
     """What measures the runs, with the training scans of the first.
 
     Raises:
-        InputError: several workers, and training on one device that is no processor.
+        InputError: several workers on one accelerator, which they would share.
     """
     first = ablation.first()
     check(
